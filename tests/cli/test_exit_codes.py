@@ -45,7 +45,7 @@ TEXTS = {
 ANY = ("Traceback", "Errno", "ValueError", "--debug", "pip install")
 
 CASES = [
-    # unknown commands, and files in the place of a command
+    # unknown commands, and files in place of a command
     ("simulate tip.toml", 2, ["No such command", "'run'"]),
     ("plot tip.nc", 2, ["'view'"]),
     ("light-curve light.csv", 2, ["'lightcurve'"]),
@@ -194,7 +194,7 @@ def test_exit_code_and_message(here, capsys, command, code, words):
     before = sorted(os.listdir(here))
     try:
         found = main(command.split())
-    except SystemExit as ended:  # wrong options, as typer finds them
+    except SystemExit as ended:  # options that typer rejects
         found = ended.code
     told = capsys.readouterr()
     assert found == code, told.err

@@ -153,7 +153,7 @@ def test_only_files_of_polhode_are_replaced_unasked(here, capsys):
     refused(capsys, ["run", "free.toml"], 1, "free.png", "--force")
     assert not (here / "free.nc").exists()
     assert main(["run", "free.toml", "-q", "--force"]) == 0
-    assert main(["run", "free.toml", "-q"]) == 0  # both are ours now
+    assert main(["run", "free.toml", "-q"]) == 0  # now polhode has written both files
 
 
 @pytest.mark.parametrize(
@@ -380,7 +380,7 @@ def test_programs_are_kept_between_runs_unless_told_otherwise(here, monkeypatch)
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-@pytest.mark.slow  # two processes without programs
+@pytest.mark.slow  # two processes without compiled programs
 def test_a_damaged_cache_is_no_error(here):
     """In new processes, since compiled programs are shared within one."""
     environment = os.environ | {"POLHODE_CACHE": str(here / "kept")}

@@ -94,4 +94,4 @@ def test_mutated_scenes_through_the_command_line(tmp_path, monkeypatch, capsys, 
         assert main(["explain", "mutated.toml"]) in (0, 1, 2), seed
         told = capsys.readouterr()
         assert "Traceback" not in told.err, seed
-        assert "--debug" not in told.err, (seed, told.err)  # what is not foreseen ends so
+        assert "--debug" not in told.err, (seed, told.err)  # the message of an unexpected error

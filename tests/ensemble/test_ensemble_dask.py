@@ -18,7 +18,7 @@ from ensemble_case import CHUNK, TS, make
 
 from polhode.ensemble._statistics import tilt
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of dask's own start and end
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings when dask starts and stops
 TILT = ens.Statistic("tilt", tilt, "rad", 0.0, 3.2, 64)
 
 

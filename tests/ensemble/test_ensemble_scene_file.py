@@ -153,7 +153,7 @@ def test_bad_options_change_nothing(options, words, tmp_path, capsys):
     scene.write_text(SCENE)
     try:
         code = main(["run", str(scene), "-o", str(tmp_path / "big.zarr"), *options])
-    except SystemExit as ended:  # options that typer refuses
+    except SystemExit as ended:  # options that typer rejects
         code = ended.code
     assert code == 2
     assert words in capsys.readouterr().err

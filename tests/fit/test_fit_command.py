@@ -104,7 +104,7 @@ def test_a_wheel_shows_the_size(tmp_path, capsys):
     found = json.loads(out.with_suffix(".json").read_text())
     off = (np.array(found["moments"]) - moments) / np.array(found["moments_std"])
     assert np.abs(off).max() < 4
-    for name in ("linear", "quadratic"):  # there is none
+    for name in ("linear", "quadratic"):  # there is no drag
         assert abs(found["drag"][name]) < 4 * found["drag_std"][name] < 1e-4
     assert np.all(np.array(found["moments_std"]) < 0.05 * moments)
 
@@ -152,4 +152,4 @@ def test_programs_for_brief_fits_give_the_same():
         expected = np.sin(np.arange(5.0)) @ np.linspace(0, 1, 5)
         np.testing.assert_allclose(run(x), expected, rtol=1e-14)
         np.testing.assert_allclose(jax.jit(run)(x), expected, rtol=1e-14)
-    assert asked == [5, 5]  # not where the fit is a part of another program
+    assert asked == [5, 5]  # not if the fit is a part of another program

@@ -113,7 +113,7 @@ def test_the_result_as_json_and_csv(of_scene, of_inertia, tmp_path):
     assert document["scale_known"] is False
     assert document["moments_std"] == [None] * 3
     assert {"inertia", "moments", "ratios", "gain"} <= {r["name"] for r in rows}
-    # what the data do not show has no standard deviation
+    # no finite standard deviation for what the data do not determine
     assert all(r["std"] == "" for r in rows if r["name"] == "moments")
 
 
@@ -125,7 +125,7 @@ def test_what_limits_a_fit_is_said(of_scene, of_inertia):
     part = of_inertia._calibration_part(0)
     assert of_inertia.limit().startswith(f"the calibration of the gyroscope ({part:.0%}")
     assert 0.5 < part <= 1
-    # with the covariance of an exact calibration the noise does
+    # with an exact calibration the noise limits it
     matrix = np.array(of_inertia.covariance)
     own, gain = slice(0, 6), slice(6, 15)
     side = matrix[own, gain]

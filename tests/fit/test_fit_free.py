@@ -100,7 +100,7 @@ def test_errors_are_as_large_as_the_bound_says(fits, cases):
     truth = cases[4] / np.linalg.eigvalsh(cases[4])[:, 2, None, None]
     error = entries(np.asarray(fits.inertia.tensor)) - entries(truth)
     square = np.einsum("ni,nij,nj->n", error, marginal, error)
-    # a body that its motion hardly shows has a valley longer than the linear theory of it holds
+    # linear theory is not valid for bodies that their motion hardly determines
     told = np.asarray(fits.diagnostics) & int(Finding.WEAK | Finding.NEARLY_FLAT) == 0
     assert told.mean() > 0.95
     # five directions are determined, the sixth is the scale
@@ -156,7 +156,7 @@ def test_what_a_fit_of_an_inertia_lacks_is_named(fits, name, message):
 def test_values_are_the_tensor_and_start_at_the_initial_rates(fits, cases):
     np.testing.assert_array_equal(fits.values[0], fits.inertia.tensor)
     assert len(fits.values) == len(fits.std) == 1
-    assert np.all(np.isinf(fits.std[0]).any(axis=(1, 2)))  # the scale does not show
+    assert np.all(np.isinf(fits.std[0]).any(axis=(1, 2)))  # the scale is not determined
     assert fits.sensor == fits.sensor_std == {}
     np.testing.assert_allclose(fits.initial.omega_body[:, 0], cases[1][:, 0], atol=0.3)
     assert fits.initial.wxyz.shape == (BODIES, 1, 4)
@@ -168,7 +168,7 @@ def test_the_scale_is_reported_as_unknown(fits):
     assert np.mean(np.asarray(fits.null_count) == 1) > 0.97
     np.testing.assert_allclose(fits.moments[:, 2], 1, rtol=1e-12)
     assert np.all(np.isinf(fits.moments_std))
-    # the tensor itself is the direction that changes nothing
+    # the tensor itself is the null direction
     tensor, information = np.asarray(fits.inertia.tensor), np.asarray(fits.information)
     change = np.einsum("nij,nj->ni", information[:, :6, :6], entries(tensor))
     assert np.abs(change).max() < 1e-8 * np.abs(information[:, :6, :6]).max()

@@ -102,7 +102,7 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     off = (np.asarray(fit.moments) - moments) / np.asarray(fit.moments_std)
     assert np.abs(off).max() < 4
     assert np.max(np.asarray(fit.moments_std) / moments) < 0.01
-    # after the tensor: drag's two numbers and the delay, in the order of their names
+    # after the tensor: two drag coefficients and the delay, by name
     spread = np.sqrt(np.diagonal(np.asarray(fit.covariance)))[6:9]
     found = fit.parameters.motion
     known = np.array([delay, 0.05, 0.02])
@@ -117,7 +117,7 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     assert 0.9 < float(fit.noise) < 1.1
 
 
-@pytest.mark.slow  # fit_scene's tests are a small one
+@pytest.mark.slow  # faster: the tests of fit_scene
 def test_any_scene_may_be_the_model():
     """A known torque determines the scale; the damping is fitted."""
     rng = np.random.default_rng(6)
@@ -343,7 +343,7 @@ def test_gradient_of_the_residuals_against_30_digits():
     def truth(y):
         """The same residuals, computed entirely by mpmath."""
         with mp.workdps(30), warnings.catch_warnings():
-            # newer mpmath announces another order of coefficients
+            # newer versions of mpmath warn of another order of coefficients
             warnings.simplefilter("ignore", DeprecationWarning)
             e = [mp.mpf(float(b)) + mp.mpf(unit) * x for b, x in zip(base.entries, y[:6])]
             a, b, c, p, q, r = e

@@ -41,7 +41,7 @@ def test_tosses_of_a_racquet_together():
     ratios = np.asarray(fit.ratios)
     np.testing.assert_allclose(ratios, [0.066, 0.935, 1], atol=0.006)
     assert float(fit.rms) <= 0.31
-    # half a turn of the racquet about its long axis: the time between changes of sign
+    # time between sign changes: half a turn of the racquet about its long axis
     middle = np.asarray(wxyz_to_matrix(fit.axes))[:, 1]
     residuals = np.asarray(fit.residuals["omega"])
     apart = []
@@ -71,7 +71,7 @@ def test_a_toss_recorded_with_left_handed_axes():
     ratios = np.asarray(fit.ratios)
     assert np.all(ratios > 0)
     assert ratios[0] + ratios[1] >= 1
-    # as recorded a plausible body, but not a racket; the twin that the report names is the racket
+    # a possible body, but not a racquet; the mirror body that the report names is the racquet
     assert ratios[0] > 0.15
     twin = np.sort(np.asarray(fit.mirror_inertia.moments))
     np.testing.assert_allclose(twin / twin[0], [1, 18, 19], atol=5)

@@ -52,7 +52,7 @@ def test_simulated_noise_has_the_allan_variance_of_its_densities():
     ):
         readings = np.asarray(sensor.read(KEY, times, still))
         found = np.mean([allan_variance(readings[:, k], counts) for k in range(3)], axis=0)
-        # a walk within an average of few samples is one of steps: 1 + 1 / (2 count^2)
+        # within an average of few samples a random walk is discrete: 1 + 1 / (2 count^2)
         share = walk**2 * tau / 3 * (sensor.bias_walk > 0)
         expected = expected + share / (2 * counts**2)
         # averages of 256 samples: 3 * 234 of them, a standard error of about 6 %
@@ -229,7 +229,7 @@ def test_two_of_three_scale_factors_of_a_free_body_leave_no_residuals():
     rates = np.asarray(
         ph.simulate(scene, ph.State([1.0, 0, 0, 0], [2.0, 3.0, -1.5]), TIMES).omega_body
     )
-    # Euler's equations with s_i omega_i: the coefficients of their products become these
+    # coefficients of Euler's equations for s_i omega_i
     coefficient = np.array(
         [(moments[(k + 1) % 3] - moments[(k + 2) % 3]) / moments[k] for k in range(3)]
     )
@@ -237,7 +237,7 @@ def test_two_of_three_scale_factors_of_a_free_body_leave_no_residuals():
     def constraint(last):
         s = np.array([1.004, 0.998, last])
         a = coefficient * s / (np.roll(s, -1) * np.roll(s, 1))
-        return a.sum() + a.prod(), s  # zero for the coefficients of a body
+        return a.sum() + a.prod(), s  # zero if the coefficients are those of a body
 
     low, high = 0.9, 1.1
     for _ in range(60):
@@ -267,7 +267,7 @@ def test_readings_at_a_limit_count_as_bounds():
     )
     codes = np.asarray(fit.diagnostics)
     assert np.all(codes & int(Finding.SATURATED) > 0)
-    # what cannot be found so says so
+    # failures are reported
     sound = codes & int(Finding.POOR | Finding.UNDETERMINED | Finding.STEP_LIMIT) == 0
     assert sound.sum() >= 4
     assert np.all(np.abs(deviations(fit, ratios))[sound] < 4)
@@ -339,7 +339,7 @@ def test_deviations_are_those_of_readings():
         options = FitOptions(gyroscope=Gyroscope(gain), bias=True, trust_noise=True)
         fit = fit_recordings([recording], options=options)
         std[size] = fit.sensor_std
-    # half of what the readings show
+    # half of the readings' size
     prior = 0.5 * float(std[2.0]["bias"][1])
     options = FitOptions(gyroscope=Gyroscope(gain, bias_std=prior), trust_noise=True)
     known = fit_recordings([recording], options=options)

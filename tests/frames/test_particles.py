@@ -50,7 +50,7 @@ def test_free_particle_seen_from_a_varying_frame_with_accelerating_origin():
     frame = RotatingFrame.from_rate(rate, origin)
     start, speed = np.array([1.0, 2.0, -0.5]), np.array([0.3, -0.2, 0.8])
     ts = jnp.linspace(0.0, 3.0, 4)
-    # at t = 0 the axes agree with those of space, the origin rests at (1, 0, 0), the rate is z
+    # at t = 0: space axes, origin at rest at (1, 0, 0), angular velocity along z
     at = start - [1.0, 0.0, 0.0]
     paths = simulate_particles(frame, at, speed - np.cross([0.0, 0.0, 1.0], at), ts, rtol=3e-14)
     lines = start + np.asarray(ts)[:, None] * speed

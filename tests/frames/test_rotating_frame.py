@@ -261,7 +261,7 @@ def test_forces_of_batches_and_no_times(rate, unchecked):
     assert frame.omega_body(jnp.zeros((2, 0), jnp.float32)).shape == (2, 0, 3)
     for times in (1, [1, 2], jnp.array([1, 2]), 1.5):
         assert frame.attitude(times).dtype == jnp.float32
-    for got in (  # of lists and integers
+    for got in (  # from lists and integers
         frame.position_to_space(1.5, [1, 2, 3]),
         frame.velocity_to_frame(1.5, [1.0, 2.0, 3.0], [1, 2, 3]),
         frame.apparent_acceleration(1.5, [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]),

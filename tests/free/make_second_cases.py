@@ -41,7 +41,7 @@ def cases() -> list[dict]:
     for power in (52, 40, 20, 10):
         near = 2.0**-power
         add(f"sphere within 2^-{power}", (1, 1 + near, 1 - near / 2), RATES, 3.0, power < 20)
-    # On either side of where a series takes over.
+    # On both sides of the threshold of a series.
     for t in (7.0, 9.0):
         add(f"sphere within 2^-10, t={t}", (1, 1 + 2.0**-10, 1 - 2.0**-11), RATES, t)
     add("oblate", (1, 1, 1.5), RATES, 3.0, False)

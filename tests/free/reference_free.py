@@ -15,7 +15,7 @@ from operator import mul
 import mpmath as mp
 
 DIGITS = 50
-_GUARD = 15  # digits more that the sums carry
+_GUARD = 15  # guard digits of the sums
 
 
 def _tensor(moments, products):
@@ -63,7 +63,7 @@ def _step(q, momentum, inverse, left, digits):
             Q[i].append(slopes[i] // (2 * (n + 1)))
     rows = [[mp.ldexp(mp.mpf(x), -bits) for x in row] for row in Q + L]
     largest = max(abs(row[n]) for row in rows for n in (order - 1, order))
-    # At most a radian, so that the last bits of the coefficients are not blown up.
+    # At most a radian, to limit the growth of rounding errors of the coefficients.
     step = min(abs(left) * rate, mp.mpf(1))
     if largest > 0:
         step = min(step, (mp.mpf(10) ** -digits / largest) ** (mp.mpf(1) / order))

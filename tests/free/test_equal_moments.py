@@ -120,12 +120,12 @@ def test_the_turn_of_axes_is_not_known_where_moments_agree_to_half_of_their_digi
     found = np.array([jax.jacfwd(turn)(zero)[0], jax.jacrev(turn)(zero)[0]])
     if gap < 1.5e-8:
         assert np.all(np.isnan(found))
-        assert jax.jvp(turn, (zero,), (zero,))[1] == 0  # what does not change is no matter
+        assert jax.jvp(turn, (zero,), (zero,))[1] == 0  # a zero tangent gives a zero derivative
     else:
         np.testing.assert_allclose(found, -1 / (2 * gap), rtol=1e-8)
 
 
-@pytest.mark.slow  # programs that take minutes to compile: each mode once, rates alone once
+@pytest.mark.slow  # programs compile for minutes: each mode once, only the rates once
 @pytest.mark.parametrize(
     ("function", "inner"), [(rates, jax.jacfwd), (attitude_and_rates, jax.jacrev)]
 )

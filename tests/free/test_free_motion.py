@@ -33,7 +33,7 @@ def _fits_single(case: dict) -> bool:
     scope="module",
     params=[
         pytest.param(("float64", jax.jacfwd), id="float64"),
-        # reverse mode: test_second_derivatives, of hundreds of bodies in tests/stress, in single
+        # reverse mode: test_second_derivatives; for hundreds of bodies tests/stress; in single
         # precision in tests/systems
         pytest.param(("float32", jax.jacfwd), id="float32", marks=pytest.mark.slow),
     ],
@@ -160,7 +160,7 @@ def test_many_times_agree_with_single_ones_in_value_and_gradient():
 
 
 def test_long_batches_are_cut_without_a_trace():
-    moments, wxyz, omega = _random_bodies(6, 16411)  # a prime: the last chunk is filled up
+    moments, wxyz, omega = _random_bodies(6, 16411)  # prime: the last chunk is padded
     t = jnp.linspace(-5.0, 5.0, 16411)
     found = MOTION(moments, wxyz, omega, t)
     whole = jax.jit(lambda *a: evaluate(prepare(*a), t))(moments, wxyz, omega)

@@ -27,7 +27,7 @@ def test_halley():
     """Belton et al. 1991: axisymmetric, theta 66 deg, P_phi 3.69 d, P_psi 7.1 d."""
     theta, precession, spin = np.deg2rad(66.0), 2 * np.pi / 3.69, 2 * np.pi / 7.1
     axial = precession * np.cos(theta) + spin
-    ratio = axial / (precession * np.cos(theta))  # of the greater to the least moment
+    ratio = axial / (precession * np.cos(theta))  # largest over smallest moment
     omega = jnp.array([precession * np.sin(theta), 0.0, axial])
     found = _periods(jnp.array([ratio, ratio, 1.0]), omega)
     np.testing.assert_allclose(found.P_phi, 3.69, rtol=1e-14)
@@ -98,7 +98,7 @@ def _by_quadrature(moments, omega, digits=30):
         ((1.0, 2.0, 3.0), (0.95, 0.3, 0.6)),
         ((1.0, 2.0, 3.0), (1.0, 0.3, 0.575)),
         ((1.0, 1.001, 0.01), (0.3, 0.2, 5.0)),
-        # a thin body far from a permanent rotation, of which the theta series converges slowest
+        # a thin body far from a permanent rotation, for which the theta series converges slowest
         (
             (0.007142514668163261, 0.8252089701268291, 0.8320578071836973),
             (140.0067128258563, 0.0, 126.43734614976562),

@@ -93,7 +93,7 @@ def test_closed_forms_agree_to_rounding_of_the_phase():
     stored = np.array([[s["wxyz"] for s in row["samples"]] for row in DATA["bodies"]])
     phase = 2 * np.pi * np.array(TURNS)
     angles = rotation_angles(np.asarray(traj.wxyz[:, 1:]), stored)
-    # a phase is known to eps times its size; where flips are rare, an error of the rates grows by
+    # a phase has an error of eps times its size; if flips are rare, an error of the rates grows by
     # the inverse of the distance to the separatrix
     growth = np.ones(len(ROWS))
     growth[list(ROWS).index("near_separatrix")] = 1e3
@@ -104,7 +104,7 @@ def test_closed_forms_agree_to_rounding_of_the_phase():
 def test_derivatives_of_the_closed_form_agree():
     for row in DATA["bodies"]:
         if len(set(row["moments"])) < 3 or row["name"] == "nearly_oblate":
-            continue  # derivatives by single moments of a body that is not symmetric any more
+            continue  # changing a single moment breaks the symmetry
 
         def final(parameters, times, row=row):
             scene = ph.Scene(ph.Inertia.from_moments(parameters[:3]))

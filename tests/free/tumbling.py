@@ -143,7 +143,7 @@ class Motion(NamedTuple):
         if not even:  # a right-handed triad of body axes: 1, -2, 3
             L2 = -L2
         psi = mp.atan2(L2, -L1)
-        # the continuous angle: psi goes with -/+ the amplitude, pi later
+        # the continuous angle: psi follows -/+ the amplitude, plus pi
         direction = 1 if (L1 * cosine >= 0 and (L2 >= 0) == (sine >= 0)) else -1
         psi = psi + 2 * mp.pi * mp.nint((mp.pi - direction * whole - psi) / (2 * mp.pi))
         theta = mp.atan2(mp.hypot(L1, L2), L3)

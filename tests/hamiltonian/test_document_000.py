@@ -184,7 +184,7 @@ def test_printed_eq_39_fails():
     equations = ph.hamiltons_equations(ph.hamiltonian(Inertia.from_moments(moments)))
     qdd = jax.jvp(lambda q, p: equations(q, p)[0], (q, p), equations(q, p))[1]
     printed = printed_eq_39(moments, q, qd)
-    np.testing.assert_allclose(printed, PRINTED_EQ_39, rtol=1e-14)  # it is the printed one
+    np.testing.assert_allclose(printed, PRINTED_EQ_39, rtol=1e-14)  # as printed
     assert abs(printed - qdd[2]) > 0.5
     np.testing.assert_allclose(doc.accelerations(moments, q, qd)[2], qdd[2], rtol=1e-13)
 
@@ -237,5 +237,5 @@ def test_hamiltons_equations_of_angles_and_momenta_that_broadcast(unchecked):
     for got, want in zip(of_bodies(Q, P), equations(Q, P)):
         assert got.shape == (2, 3)
         np.testing.assert_allclose(got[0], want, rtol=1e-15)
-    total = ph.hamiltons_equations(lambda q, p: jnp.sum(p**2) / 2)  # of all bodies together
+    total = ph.hamiltons_equations(lambda q, p: jnp.sum(p**2) / 2)  # a sum over all bodies
     np.testing.assert_allclose(total(jnp.array([Q, Q]), momenta)[0], momenta, rtol=1e-15)

@@ -80,7 +80,7 @@ def test_the_status_tells_what_no_body_has():
     tensors = jnp.stack([jnp.diag(moments[0]), jnp.diag(moments[2]), skew, jnp.full((3, 3), 1.0)])
     wrong = ph.Status.NOT_PHYSICAL
     np.testing.assert_array_equal(of_tensor(tensors), [0, wrong, wrong, wrong])
-    # known numbers that were given by name are judged when they move
+    # values passed by keyword are checked in a simulation
     with pytest.raises(ph.SimulationError, match="no body has this inertia"):
         ph.simulate(ph.Scene(Inertia(diagonal=[2.0, 1.0, -0.5])), STATE, TS)
 

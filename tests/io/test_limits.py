@@ -64,7 +64,7 @@ def test_the_schema_and_the_page_name_the_same_keys():
     words = set(re.findall(r"\w+", " ".join(re.findall(r"`+[^`]+`+", page, re.DOTALL))))
     assert len(keys) > 70
     assert keys - words == set()
-    # choices too: shapes, kinds, units
+    # also choices: shapes, kinds, units
     choices = {
         c
         for t in tables

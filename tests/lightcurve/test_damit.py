@@ -97,7 +97,7 @@ BODIES = {
 @pytest.mark.parametrize("name", BODIES)
 def test_the_files_give_the_motion_back(name, tmp_path):
     moments, omega = BODIES[name]
-    # semi-axes of a homogeneous ellipsoid do not matter here: any order along the body axes
+    # the order of the semi-axes along the body axes does not matter here
     solution, scene, state = solution_of(moments, omega)
     assert solution.mode == (ph.Mode.SAM if name.startswith("short") else ph.Mode.LAM)
     assert solution.to_damit(tmp_path, jd_of_zero=2450000.0) == tmp_path

@@ -118,13 +118,13 @@ def test_steps_keep_the_frequencies_that_they_mean(trial):
 
     unknowns, wxyz = trial
     step = jnp.zeros((len(wxyz), unknowns.shape[1] + 3)).at[:, 0].set(0.03).at[:, 5].set(0.02)
-    # by differences of fourth order: the derivative would be one more program
+    # by differences of fourth order, since the derivative would be another program
     ends = [logs(unknowns + 0.01 * k * step[:, :-3]) for k in (-2, -1, 1, 2)]
     meant = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / 0.12
     plain = logs(unknowns + step[:, :-3]) - logs(unknowns) - meant
     moved = STEPPED(trial, step)
     rest = logs(moved.unknowns) - logs(unknowns) - meant
-    # near the separatrix a body keeps its plain step
+    # near the separatrix the step is not corrected
     mended = np.abs(rest).max(1) < 1e-5
     assert mended.mean() > 0.7
     assert np.median(np.abs(plain)[mended]) > 100 * np.median(np.abs(rest)[mended])
@@ -187,7 +187,7 @@ def test_a_tumbler_is_found_again():
     fit = lightcurve.fit_light_curve(curve, floor=0.005, trials=8_000)
     best, text = fit.best, lightcurve.table(fit)
     assert int(best.mode) == int(truth.mode), text
-    # the first time of the light curve is not that of the state: periods do not change
+    # another first time of the light curve does not change the periods
     assert best.P_phi == pytest.approx(float(truth.P_phi), rel=2e-3), text
     assert best.P_psi == pytest.approx(float(truth.P_psi), rel=5e-3), text
     pole = np.asarray(_solutions.momentum(body))[0]
@@ -234,7 +234,7 @@ def test_tc4_in_the_night_of_2012(shared, tmp_path):
         pytest.skip("the folder of light curves is absent")
     pytest.importorskip("matplotlib")
     said = []
-    # every third point: as many as a search looks at, so that search and fit are one program
+    # every third point, the number that a search uses: search and fit share a program
     header, *rows = (folder / "tc4_2012.csv").read_text().splitlines()
     few = tmp_path / "few.csv"
     few.write_text("\n".join([header, *rows[::3]]) + "\n")

@@ -36,7 +36,7 @@ def test_pairs_explain_what_least_squares_say(series, even):
         whole = np.hstack([*basis, np.cos(phases), np.sin(phases)])
         left = [value - m @ np.linalg.lstsq(m, value, rcond=None)[0] for m in (columns.T, whole)]
         explained = 1 - np.sum(left[1] ** 2) / np.sum(left[0] ** 2)
-        # sums near a multiple of one a day are almost constants of the nights
+        # combinations near a multiple of one per day are nearly constant within nights
         assert found.explained[k] == pytest.approx(explained, abs=0.01)
     assert found.explained[0] > 0.9
 
@@ -77,7 +77,7 @@ def test_hypotheses_hold_the_body(waves, long_axis):
     meant = _frequencies.hypotheses(found, t, value)
     near = np.hypot(meant.f_phi - F_PHI, meant.f_psi - F_PSI) < 0.5 * found.resolution
     assert np.any(near[:20] & (meant.long_axis[:20] == long_axis))
-    # no moment exceeds the sum of the other two: SAM turns no slower about L than its long axis
+    # by the triangle inequality, precession is not slower than the rotation about the long axis
     assert np.all(meant.long_axis | (meant.f_psi <= meant.f_phi))
     assert len(near) <= 800
 

@@ -52,7 +52,7 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     light = np.asarray(magnitudes(PHASE, bodies, points))[first, : blank.t.size]
     points = blank._replace(magnitude=light + 0.3 * (blank.t > 5)).points(0.0)
     right, matrix = _search.series(points, *meant)
-    # the same body at other times and turned about its momentum: all that phases are
+    # the same body at other times and rotated about its momentum: other phases
     later = jnp.asarray(np.random.default_rng(1).uniform(0, 10, (MANY, 1)))
     same = jax.tree.map(lambda x: jnp.tile(x[first], (MANY, 1)), bodies)
     rates, wxyz = moved(same, later)
@@ -76,7 +76,7 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     # 15 degrees at most from the nearest node in either angle
     assert np.median(before) > 0.3 * whole
     assert np.max(after) < 0.15 * whole
-    # what the series says of it: all but that part of chi-square is explained
+    # the fraction of chi-square that the series does not explain
     data = points.magnitude[0, : len(light)]
     fall = np.asarray(fall, float)
     assert np.min(fall) * 0.02**2 / len(light) > 0.7 * whole

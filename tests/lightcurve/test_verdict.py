@@ -109,7 +109,7 @@ def test_one_period_is_told_from_tumbling(cases):
     assert single.name.startswith("one period")
     assert min(abs(single.periods[0] / p - 1) for p in (0.37, 0.185)) < 1e-3
     assert single.misfit == pytest.approx(1.0, abs=0.15)
-    # a body that explains less does not change that
+    # a body that fits worse does not change this
     worse = verdict(case, solution(offset_free(case, flat)))
     assert worse.verdict is Verdict.ONE_PERIOD
 
@@ -239,7 +239,7 @@ def test_a_refit_gains_nothing_by_offsets_without_points_or_by_ending_early():
     block = np.repeat(np.arange(6), 10)
     offsets = (block[:, None] == np.arange(6)).astype(float)
     derivatives = np.hstack([rng.normal(size=(60, 2)), offsets])
-    residuals = 0.3 + rng.normal(size=60)  # the offsets are not those of the least cost
+    residuals = 0.3 + rng.normal(size=60)  # the offsets are not at the minimum of the cost
     none = np.zeros((8, 8)), np.zeros(8)
     weight = np.vstack([np.ones(6), [0, 2, 1, 1, 1, 1]]).astype(float)
     solution = _solutions.Linearised(residuals, derivatives, *none)
@@ -343,7 +343,7 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
         )
         assert found.verdict is expected
     assert "assumption on the shape" in found.reasons[0]
-    # unless convex bodies with the motion of the ellipsoid are excluded by far
+    # unless convex bodies with the ellipsoid's motion are clearly excluded
     for odds, expected in ((1e-5, Verdict.AMBIGUOUS), (1e-8, Verdict.TUMBLING)):
         rival = other._replace(probability=odds, model=body.model + 0.1)
         found = _verdict.judge(
@@ -360,7 +360,7 @@ def test_an_ellipsoid_whose_convex_body_is_excluded_does_not_make_a_result_ambig
     for convex, expected in (
         (ellipsoid._replace(probability=1e-8), Verdict.TUMBLING),
         (ellipsoid._replace(probability=1e-4), Verdict.AMBIGUOUS),
-        (body, Verdict.TUMBLING),  # with a convex shape it has the best motion
+        (body, Verdict.TUMBLING),  # the best motion, with a convex shape
     ):
         found = _verdict.judge(
             linear,
@@ -577,7 +577,7 @@ def test_derivatives_of_convex_bodies(convex_case):
         e = size * np.eye(8)[k]
         measured = (value(e, none)[0] - value(-e, none)[0]) / (2 * size)
         scale = np.abs(measured).max()
-        # facets appear and vanish: single points differ
+        # facets become visible or dark: single points differ
         off = np.abs(motion[:, k] - measured) / scale
         assert np.median(off) < 1e-6
         assert np.quantile(off, 0.95) < 1e-2

@@ -39,7 +39,7 @@ class Browser:
         get, give_back = os.pipe()
         get_back, give = os.pipe()
         options = [*_OPTIONS, f"--user-data-dir={profile}", "--window-size={},{}".format(*size)]
-        # the browser reads what is asked on descriptor 3 and answers on descriptor 4
+        # the browser reads requests from descriptor 3 and writes responses to descriptor 4
         line = f'exec "$0" "$@" 3<&{get} 4>&{give}'
         self.process = subprocess.Popen(
             ["bash", "-c", line, program, *options, "about:blank"],
@@ -110,7 +110,7 @@ class Browser:
         from matplotlib.image import imread
 
         twice = "new Promise(r => requestAnimationFrame(() => requestAnimationFrame(() => r(1))))"
-        self.run(twice)  # what was asked for has been drawn
+        self.run(twice)  # wait until the frame is drawn
         picture = base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
         return imread(io.BytesIO(picture), format="png")[..., :3]
 

@@ -15,7 +15,7 @@ from polhode import plot
 from polhode.plot import _view
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
-TURN = 2 * np.pi  # s: one turn of the spinning body
+TURN = 2 * np.pi  # period of the spinning body [s]
 
 
 def known(page: plot.View) -> dict:
@@ -76,7 +76,7 @@ def test_momentum_of_wheels_is_shown():
     body = motion["bodies"][0]
     np.testing.assert_allclose(body["momentum_space"], moved.momentum_space, rtol=1e-6)
     assert body["momentum_space"][0, 2] > 5
-    # the momentum stays, but the ellipsoid does not roll on the plane normal to it
+    # the momentum is constant, but the ellipsoid does not roll on the plane normal to it
     assert np.ptp(body["momentum_space"], axis=0).max() < 1e-5
     assert motion["plane"] == "tangent plane"
 
@@ -246,7 +246,7 @@ def test_a_browser_shows_the_body_and_the_slider_moves_it(browser, tmp_path):
     quarter = at(browser, 1.0 + TURN / 4)
     assert browser.run("document.getElementById('readout').textContent") == "t = 2.57 s"
     assert changed(first, quarter) > 0.01
-    # a whole turn later everything is where it was
+    # after a full turn the picture is the same
     assert changed(first, at(browser, 1.0 + TURN)) < 0.002
     assert changed(first, at(browser, 1.0)) == 0
     assert not browser.faults
@@ -258,7 +258,7 @@ def test_a_browser_plays_and_hides(browser, trajectory, tmp_path):
     plot.view(trajectory, page, names=["first", "second"])
     browser.open(page.as_uri())
     time = "Number(document.getElementById('time').value)"
-    browser.wait(f"{time} > 0.2")  # it plays by itself
+    browser.wait(f"{time} > 0.2")  # it starts automatically
     browser.run("document.getElementById('play').click()")
     stopped = browser.run(time)
     shown = browser.look()

@@ -65,7 +65,7 @@ def test_no_body_is_far_beyond_the_error_asked_for(kind):
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = errors(found, exact(kind, False))
         assert np.max(off) < 10 * rtol, (rtol, np.argmax(off), np.max(off) / rtol)
-        usual = np.median(off[MADE[kind]["angle"] > 10])  # the way of several steps
+        usual = np.median(off[MADE[kind]["angle"] > 10])  # several steps
         assert 0.01 * rtol < usual < 3 * rtol, (rtol, usual / rtol)
 
 
@@ -80,7 +80,7 @@ def test_nor_in_single_precision(kind):
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = errors(found, exact(kind, True))
         angle = MADE[kind]["angle"]
-        lost = 6 * np.finfo(np.float32).eps * np.maximum(angle, 1)  # rounding turns a body on
+        lost = 6 * np.finfo(np.float32).eps * np.maximum(angle, 1)  # rounding errors accumulate
         assert np.all(off < 10 * (rtol + lost)), (rtol, np.max(off / (rtol + lost)))
         assert np.median(off) > 0.005 * rtol
         assert np.all(off[angle < 10] < 10 * rtol), (rtol, np.max(off[angle < 10] / rtol))
@@ -111,7 +111,7 @@ def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = np.max(np.asarray(rotation.angle_between(found.wxyz, fine.wxyz)), axis=1)
         assert np.max(off) < 10 * rtol, (rtol, np.max(off) / rtol)
-        assert np.max(off) > 1e-3 * rtol or count == 600  # whose steps are short
+        assert np.max(off) > 1e-3 * rtol or count == 600  # which has short steps
 
 
 def test_few_steps_of_a_body_that_comes_to_rest_are_refused():

@@ -91,7 +91,7 @@ def test_both_modes_are_the_slope():
     slopes = jax.jit(jax.grad(fn))(p)
     products = jax.tree.map(lambda s, d: jnp.sum(s * d), slopes, direction)
     np.testing.assert_allclose(sum(jax.tree.leaves(products)), want, rtol=1e-9)
-    assert all(abs(float(x)) > 1e-6 for x in jax.tree.leaves(products))  # every one takes part
+    assert all(abs(float(x)) > 1e-6 for x in jax.tree.leaves(products))  # all have an effect
     np.testing.assert_allclose(both(p, direction)[1], want, rtol=1e-9)
 
 
@@ -245,7 +245,7 @@ def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
 
     p = jnp.array([bodies.MOMENTS[0], bodies.STRENGTH])
     want = [float(x) for x in TRUTH["slopes"]]
-    rtol = 1e-4 if name == "implicit" else 1e-10  # it starts backwards from its own end
+    rtol = 1e-4 if name == "implicit" else 1e-10  # backward from the computed end
     both = jax.jit(lambda p: (jax.jacrev(loss)(p), jax.jacfwd(loss)(p)))(p)
     for slopes in both:
         np.testing.assert_allclose(slopes, want, rtol=rtol)
@@ -352,7 +352,7 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
     found = [jax.jit(mode(partial(angle, intervals=n)))(p) for n in (1, 8)]
     np.testing.assert_allclose(found[1], want, rtol=1e-9)
     if mode is jax.jacrev:
-        assert np.isnan(found[0]).all()  # what the saved times are for
+        assert np.isnan(found[0]).all()  # without the saved times it is NaN
 
 
 @pytest.mark.parametrize(

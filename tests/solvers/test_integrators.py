@@ -103,7 +103,7 @@ EXTRAPOLATION_STEPS = {
 @pytest.mark.parametrize("order", EXTRAPOLATION_STEPS)
 def test_extrapolation_has_its_order(order):
     found, errors = measured_order(Extrapolation(order), *EXTRAPOLATION_STEPS[order])
-    assert errors[1] > 1e-14  # above rounding: the slope means something
+    assert errors[1] > 1e-14  # above rounding, so that the order is meaningful
     assert abs(found - order) < 0.1 * order
 
 
@@ -207,7 +207,7 @@ def test_kernel_with_unused_operands_and_other_operations():
     x = jnp.arange(5.0)
     calls = []
     jax.jit(kernel(lambda a: calls.append(0) or jnp.sort(-a)))(jnp.ones(3))
-    assert len(calls) == 1  # one that a unit cannot hold is not traced again
+    assert len(calls) == 1  # a function that cannot be fused is not traced again
     add = kernel(lambda a, unused, b: a + b)
     np.testing.assert_array_equal(jax.jit(add)(x, x * 2, x), 2 * x)
     np.testing.assert_array_equal(jax.jit(kernel(lambda a: jnp.sort(-a)))(x), -x[::-1])

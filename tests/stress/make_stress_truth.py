@@ -24,7 +24,7 @@ from reference_free import _step, _tensor
 from benchmarks.stress_families import Body, bodies, nutation
 
 DIGITS = 50
-# Neighbours part by up to nine decades: the step's square stays below the last digit of a double.
+# Deviations grow by up to nine decades: the squared step is still below double precision.
 STEP = mp.mpf(10) ** -21
 
 

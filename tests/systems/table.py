@@ -182,7 +182,7 @@ SYSTEMS = [
         (0, 5),
         {"fading": 0.125},
     ),
-    # what was added to the simple torques, one system each
+    # one system for each part that is not a simple torque
     System("torque_from_a_table", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4), {"table": CURVE}, 28),
     System(
         "air_drag",

@@ -50,7 +50,7 @@ CASES = {
     "tumbling about its centre": (TILTED, numbers_of([0.5, -0.3, 2.0], distance=0.0)),
     "slowly without mass": (TILTED, numbers_of([5e-3, -3e-3, 2e-3], mass=0.0, gravity=SLANTED)),
 }
-WHEELS = {  # the second takes up the momentum of the body, which has none in all
+WHEELS = {  # the second wheel cancels the momentum of the body
     "with a wheel": (ph.Rotor.axial(momentum=0.7), REST),
     "balanced by a wheel": (ph.Rotor.axial(momentum=-3.0), [0.0, 0.0, 1.0]),
 }
@@ -119,7 +119,7 @@ def test_bodies_at_rest_among_others(dtype, bound):
     start = ph.State(axes, rates).wxyz[0]
     np.testing.assert_allclose(wxyz[0], start, rtol=0, atol=bound)
     np.testing.assert_array_equal(omega[0], 0)
-    # a body at rest: its rates grow by the torque, its attitude by half of that times the time
+    # a body at rest: rates grow as torque times time, the attitude by half of that times time
     down = ph.rotation.rotate(ph.rotation.conjugate(start), gravity)
     pull = jnp.cross(jnp.array([0, 0, 1], dtype), down) / jnp.array([2, 2, 3], dtype)
     np.testing.assert_allclose(by_distance[1][0], 3 * pull, rtol=0, atol=30 * bound)

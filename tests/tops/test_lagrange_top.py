@@ -55,7 +55,7 @@ def test_every_regime_is_exact(exact, dtype, bound):
     got = np.array(VALUE(tuple(x), jnp.full(len(NAMES), top_cases.TIME, dtype)), float).T
     for name, state, entry in zip(NAMES, got, exact):
         error = np.abs(state - entry["state"]).max() / max(1, np.abs(entry["state"]).max())
-        # an unstable equilibrium or separatrix multiplies the rounding of the numbers given
+        # an unstable equilibrium or separatrix amplifies the rounding of the input
         growth = max(1.0, np.abs(entry["gradient"]).max() / 10)
         assert error < bound * growth, (name, error)
 
@@ -112,7 +112,7 @@ def test_a_top_that_leaves_the_upright_and_comes_back():
     q = np.array(q) / np.linalg.norm(q, axis=0)
     u1, u2 = 2 * (q[1] * q[3] - q[0] * q[2]), 2 * (q[2] * q[3] + q[0] * q[1])
     below = 2 * (q[1] ** 2 + q[2] ** 2)
-    energy = a * (w1 * w1 + w2 * w2) / 2 - pull * below  # above that of the sleeping top
+    energy = a * (w1 * w1 + w2 * w2) / 2 - pull * below  # relative to the sleeping top
     vertical = a * (u1 * w1 + u2 * w2) - c * w3 * below  # likewise
     assert below.max() > 0.5
     assert np.abs(energy).max() < 1e-7

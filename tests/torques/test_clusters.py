@@ -110,7 +110,7 @@ def test_dumping_is_normal_to_the_field_and_limited():
     np.testing.assert_allclose(found, np.cross(moment, FIELD), rtol=1e-12)
 
 
-# at t = 0 of this orbit x of the local frame is along space y, z along -x, hence y along -z
+# at t = 0 the axes x, y, z of the orbit frame are along space y, -z, -x
 FRAME = ph.LVLH(ph.KeplerOrbit(1.0, 1.0))
 IN_FRAME = np.array([[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]) @ FIELD
 

@@ -79,7 +79,7 @@ def test_a_wheel_with_friction_about_one_axis():
     got = ph.simulate(scene(friction), state, ts, rtol=1e-12, record=WORK)
     rate = 1 / j + 1 / (c - j)
     fade = np.exp(-friction * rate * ts)
-    taken = j * speed / c * (1 - fade)  # what the body's rate gains
+    taken = j * speed / c * (1 - fade)  # increase of the body's rate
     np.testing.assert_allclose(got.omega_body[:, 2], 1 + taken, rtol=1e-11)
     np.testing.assert_allclose(got.wheel_speed[:, 0], speed * fade, rtol=1e-11)
     lost = -0.5 * speed**2 / rate * (1 - fade**2)

@@ -92,7 +92,7 @@ def growth(scene):
     scene = scene.settled(STATE, jnp.array(0.25))
     momentum = tuple(scene.momentum(STATE.omega_body, TIME))
     wxyz, dynamics = tuple(STATE.wxyz), scene.dynamics
-    spins = ((jnp.array(0.7),),) if dynamics.coupled else ()  # any, not those of the start
+    spins = ((jnp.array(0.7),),) if dynamics.coupled else ()  # arbitrary, not the initial ones
     y = (momentum, wxyz, *spins)
     rates = lie_poisson_field(TIME, y, dynamics)
 

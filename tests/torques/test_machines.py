@@ -76,7 +76,7 @@ def test_a_motor_within_its_limits():
     exact = solve_ivp(
         field, ts[[0, -1]], start, "DOP853", ts, rtol=1e-11, atol=1e-13, max_step=0.01
     )
-    assert np.max(np.abs(exact.y[2])) > 0.5 * top  # it meets its limits
+    assert np.max(np.abs(exact.y[2])) > 0.5 * top  # it reaches its limits
     np.testing.assert_allclose(got.omega_body[:, 2], exact.y[1], rtol=0, atol=1e-8)
     np.testing.assert_allclose(got.wheel_speed[:, 0], exact.y[2], rtol=0, atol=1e-6)
     np.testing.assert_allclose(got.motor_work[:, 0], exact.y[3], rtol=0, atol=1e-7)
@@ -96,7 +96,7 @@ def test_pulses_within_other_parts_keep_their_edges():
         for torque in (whole, whole.during(t)):
             slip = torque.slip(jnp.array(t), momentum, omega)
             np.testing.assert_allclose(slip, on * want, atol=1e-16)
-    # what acts between the edges does not ask the time again
+    # between the edges nothing depends on time
     np.testing.assert_allclose(whole.during(1.5).slip(jnp.array(9.0), momentum, omega), want)
     np.testing.assert_array_equal(whole.during(3.0).slip(jnp.array(1.5), momentum, omega), 0)
 

@@ -73,7 +73,7 @@ ECCENTRIC = ph.KeplerOrbit(MU, 9e6, 0.2, inclination=0.7, node=0.4, periapsis=-0
 def test_the_frame_is_where_its_definition_puts_it():
     """Axes from the two-body problem in NumPy, rates from differences of the axes."""
     times = np.array([0.0, 1234.5, 6000.0])
-    orbits = (ECCENTRIC, lambda t: ECCENTRIC(t))  # of a function the plane may turn
+    orbits = (ECCENTRIC, lambda t: ECCENTRIC(t))  # with a function the orbital plane may rotate
     start = np.concatenate([ECCENTRIC(0.0), ECCENTRIC.velocity_at(0.0)])
     truth = two_bodies(start[:3], start[3:], times)
     z = -truth[:, :3] / np.linalg.norm(truth[:, :3], axis=-1, keepdims=True)

@@ -67,15 +67,15 @@ def test_the_estimate_bounds_the_error(rtol):
     state = ph.State(wxyz, 2 * jax.random.normal(keys[1], (40, 3)))
     scene, ts = ph.Scene(INERTIA, GRAVITY), jnp.array([0.0, 60.0])
     record = ph.Record(final_only=True, error=True)
-    # With compensated sums: what rounding adds to plain ones is as large as the estimate.
+    # With compensated sums; rounding of plain sums is as large as the estimate.
     solver = ph.Extrapolation(16, compensated=True)
     pushed = ph.State(wxyz, state.omega_body + 1e-9)
     best, beside = (
         ph.simulate(scene, x, ts, ph.LiePoisson(solver), rtol=5e-14).wxyz[:, -1]
         for x in (state, pushed)
     )
-    # A rate off by 1e-9 rad/s turns a regular top by 60 to 500 times that [rad] in the 60 s, a
-    # chaotic one by 2,500 to 2e6: how its errors grow is not what the estimate is good for.
+    # An error of 1e-9 rad/s grows to 60 to 500 times that [rad] in 60 s for a regular top, and to
+    # 2,500 to 2e6 times for a chaotic one, whose growth the estimate does not predict.
     calm = np.asarray(rotation.angle_between(best, beside)) < 1e-9 * 1000
     assert np.sum(calm) > 30
     traj = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)

@@ -181,7 +181,7 @@ def _compare(units, way, how):
 
     def both(unknown):
         nonlocal one
-        one = unknown  # lest XLA works all of it out while it compiles
+        one = unknown  # traced, so that XLA cannot evaluate everything during compilation
         return all_of(marked=True), all_of(marked=False)
 
     found, plain = jax.jit(both)(one)

@@ -50,7 +50,7 @@ def field_operations(scene):
     """Floating-point operations of one evaluation of the field for one body."""
     y = (tuple(jnp.ones(N) for _ in range(3)), tuple(jnp.ones(N) for _ in range(4)))
     system = Dynamics(scene.hamiltonian, scene.torque)
-    # before fusion: XLA works shared parts out anew in every output, which is not what is asked
+    # before fusion, since XLA then repeats shared parts in every output
     return jax.jit(lie_poisson_field).lower(0.0, y, system).cost_analysis()["flops"] / N
 
 

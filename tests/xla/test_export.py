@@ -20,7 +20,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize(
-    ("kind", "what"),  # the program of a gradient holds that of the value
+    ("kind", "what"),  # the program of a gradient contains that of the value
     [("Lagrange", "value"), *((kind, "gradient") for kind in SCENES if kind != "Lagrange")],
 )
 def test_programs_are_exported_for_other_platforms(kind, what):

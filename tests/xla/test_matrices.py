@@ -29,7 +29,7 @@ def affected(monkeypatch):
 
 def largest_batch(function, *args):
     """Largest number of matrices in a LAPACK call of the program, and number of calls."""
-    text = jax.jit(lambda *args: function(*args)).lower(*args).as_text()  # traced anew
+    text = jax.jit(lambda *args: function(*args)).lower(*args).as_text()  # not cached
     calls = [line for line in text.splitlines() if "@lapack_" in line]
     shapes = [
         [int(size) for size in shape.split("x")[:-1]]

@@ -436,7 +436,7 @@ def test_derivatives_of_a_free_body_are_units(derivative):
     sizes = {f.split("(")[0].split("@")[-1]: len(f.splitlines()) for f in functions if "@" in f}
     assert len(units) == 2
     assert sum(sizes[name] for name in units) > 4000
-    # functions that others call stand inside of units too, but are short
+    # functions that others call are inside fused kernels too, but are short
     assert max(size for name, size in sizes.items() if name not in units) < 500
 
 
