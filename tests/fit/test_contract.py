@@ -1,4 +1,4 @@
-"""The public contract of ``polhode.fit``: its names, their annotations, options and results."""
+"""The public interface of ``polhode.fit``: names, annotations, options and results."""
 
 import inspect
 
