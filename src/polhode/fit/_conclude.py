@@ -228,7 +228,7 @@ def _deviations(determination: Determination, count: int) -> Array:
 
 
 def _deviations_by_kind(determination: Determination, solution: Solution, count: int) -> _Split:
-    """Standard deviations of the shared unknowns; for the gain those of the matrix in ``_sensor``."""
+    """Standard deviations of the shared unknowns; for the gain, of the matrix in ``_sensor``."""
     parameters, gain = solution.parameters, solution.model.gyroscope.gain
     std = _deviations(determination, solution.linear.shared.shape[-1])
     split = _sort_by_kind(std, count, parameters)
