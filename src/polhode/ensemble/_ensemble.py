@@ -93,7 +93,7 @@ class Ensemble(eqx.Module):
             constant_torque(self.scene)
 
     def lanes(self, indices: np.ndarray) -> tuple[Any, Any]:
-        """Arguments of ``draw`` for ``indices``: (leaves and rows of these bodies, shared leaves)."""
+        """Arguments of ``draw`` for ``indices``: (leaves and rows of the bodies, shared leaves)."""
         parts = (self.scene, self.state)
         lane_parts, shared = eqx.partition(parts, is_lane_tree(parts))
         dtype = self.state.wxyz.dtype

@@ -92,7 +92,7 @@ class Block:
         self.compiled: list[Any] = []
 
     def inputs(self, first_body: int) -> tuple:
-        """The arguments of ``program`` for the block that starts at ``first_body``, on its device."""
+        """The arguments of ``program``, on its device, for the block starting at ``first_body``."""
         device = self.devices[first_body // self.size % len(self.devices)]
         indices = np.arange(first_body, first_body + self.size)
         lane_parts, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))

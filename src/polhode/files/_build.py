@@ -413,7 +413,7 @@ def _solver(file: SceneFile, name: str) -> "diffrax.AbstractSolver":
 
 
 class Clones(NamedTuple):
-    """A batch of bodies, the nominal one first; `redrawn`: number of draws rejected as unphysical."""
+    """A batch of bodies, the nominal one first; `redrawn`: number of unphysical draws, rejected."""
 
     inertia: Inertia
     state: "polhode.State"
