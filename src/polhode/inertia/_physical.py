@@ -151,7 +151,7 @@ def principal(
 
 
 def _as_tensors(value: Any, name: str = "tensor") -> Array:
-    """Tensors (..., 3, 3) of floats, also from lists. NaN is accepted; JAX arrays pass unchanged."""
+    """Tensors (..., 3, 3) of floats, also from lists. NaN is accepted; JAX arrays are unchanged."""
     fits = isinstance(value, jax.Array) and value.shape[-2:] == (3, 3)
     if fits and jnp.issubdtype(value.dtype, jnp.floating):
         return value
