@@ -343,7 +343,7 @@ def wheel_cluster(
     [rad/s], (n,) or one number; ``max_torque`` of each motor [N m], (n,) or one number, or None;
     ``friction`` of each bearing, such as ``ph.ViscousCoupling``; ``null_gain`` [1/s] and ``bias``
     [rad/s], (n,) or one number: null motion drives the speeds to the bias as far as that exerts no
-    torque on the body; ``first``: the number of other wheels that stand before these in the scene.
+    torque on the body; ``first``: the index of the first of these wheels among those of the scene.
     All bodies of a batch share these numbers.
 
     The wheels share the command by the pseudo-inverse of their axes, with the least sum of squares

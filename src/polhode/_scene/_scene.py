@@ -274,7 +274,7 @@ class Scene(Printable):
     def carrier(self) -> Inertia:
         """The inertia without the axial moments of wheels whose speed is not prescribed.
 
-        For an inertia that varies with time that at t = 0; see ``carrier_at``.
+        If the inertia varies with time, at t = 0; see ``carrier_at``.
         """
         return self.carrier_at(0.0)
 
@@ -495,7 +495,7 @@ def specialise(scene: Scene) -> Scene:
         raise TypeError(f"specialise takes a ph.Scene, got {type(scene).__name__}.")
     if not is_concrete(scene):
         raise ValueError("specialise needs concrete numbers: call it outside of jit and grad.")
-    with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+    with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
         inertia, potential, rotors = map(narrower, (scene.inertia, scene.potential, scene.rotors))
         torque = jax.tree.map(narrower, scene.torque, is_leaf=lambda x: isinstance(x, KeplerOrbit))
     return Scene(inertia, potential, torque, rotors)

@@ -163,7 +163,7 @@ class AbstractRotor(AbstractPart):
         for wheel in self.wheels:
             if wheel.inertia is None:
                 continue
-            with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+            with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
                 about = _moment_about(inertia, wheel.direction)
             require(
                 np.asarray(wheel.inertia) < about,

@@ -540,7 +540,7 @@ class Trajectory(eqx.Module):
 
         **Arguments:** ``path``; ``epoch``: calendar time at which ``ts`` is zero, such as
         ``"2029-04-13T21:46:00"``; fields of the message: ``object_name`` and ``object_id``
-        (required; for a batch one for each body), ``frame`` ("EME2000": that of space),
+        (required; for a batch one for each body), ``frame`` ("EME2000": the space frame),
         ``body_frame`` ("SC_BODY_1"), ``time_system`` ("TAI"), ``originator`` ("POLHODE"),
         ``center_name`` (None), ``rates`` (True: body rates too), ``creation_date`` (now).
 

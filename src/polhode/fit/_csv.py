@@ -43,7 +43,7 @@ def read_recording(
     a decimal comma. Lines before the header that are empty or start with # are skipped.
 
     Raises FileNotFoundError, and ValueError for a file that is not text, missing, ambiguous or
-    repeated columns, a ``scale`` of another unit than the columns state, cells that are no numbers,
+    repeated columns, a ``scale`` of another unit than the columns state, cells without a number,
     unsorted or repeated times (each with its line) and rates that appear to be in deg/s.
     """
     return load_recording(path, columns, scale=scale, time_scale=time_scale, noise=noise).recording

@@ -246,7 +246,7 @@ def fit_scene(
     - ``prior_std``: for each array of ``free`` the standard deviation of a normal prior about its
       starting value, a number or an array of its shape, or None.
     - ``attitude`` (4,): initial attitude ``wxyz``, for recordings without attitudes; None: the
-      body axes are those of space at the first time.
+      identity.
     - ``method``, ``rtol``: as in ``ph.simulate``.
     - ``options``: ``FitOptions``, of which these apply: ``robust``, ``bias``, ``trust_noise``,
       ``gyroscope`` (by default with scale factors and axes uncertain by 1 %, which widens ``std``;

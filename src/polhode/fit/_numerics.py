@@ -301,8 +301,8 @@ def _two_sided(low: Array, high: Array) -> tuple[Array, Array, Array]:
 
 
 def _one_sided(start: Array, low: Array, high: Array) -> tuple[Array, Array, Array, Array]:
-    """For one bound: the sign of the side inside, the bound, the distance within which the map is
-    curved, and whether there is a bound."""
+    """For one bound: the sign of the permitted side, the bound, the distance within which the map
+    is curved, and whether there is a bound."""
     side = jnp.where(jnp.isfinite(low), 1, -1)
     has_bound = jnp.isfinite(low) | jnp.isfinite(high)
     end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))

@@ -445,7 +445,7 @@ class RotatingFrame(eqx.Module):
     # --- transformations, both ways (docs/equations.md, 003: 4-19) -----------------------
 
     def position_to_space(self, t: Time, position: Vector, *, wxyz: ArrayLike = None) -> Vector:
-        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
+        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude if known."""
         space_vector = self._rotate_to_space(t, position, wxyz)
         return space_vector if self.origin is None else _sum(space_vector, self._origin(t)[0])
 
@@ -527,7 +527,7 @@ class RotatingFrame(eqx.Module):
     ) -> Vector:
         """Sum of the apparent forces per unit mass [m/s^2]; ``velocity`` None: at rest in it.
 
-        Only the terms that this frame has are computed. ``wxyz``: the attitude, if it is known.
+        Only the terms that this frame has are computed. ``wxyz``: the attitude at ``t``, if known.
         """
         apparent = self._without_origin(t, position, velocity)
         if self.origin is None:

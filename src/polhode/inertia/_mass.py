@@ -307,7 +307,7 @@ def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray
     vertices, faces = as_triangles(vertices, faces)
     _check_closed(faces)
     if is_concrete(vertices) and vertices.size:
-        with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+        with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
             volume = np.asarray(mesh_integrals(vertices, faces)[0])
         require(
             volume > 0,

@@ -260,7 +260,7 @@ def as_matrices(value: Any) -> tuple[Array, Array]:
         matrix = as_float_array("matrix", value, (3, 3), finite=False)
     if not is_concrete(matrix):
         return matrix, _rotation_error(jax.lax.stop_gradient(matrix))[0]
-    with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+    with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
         good, size = _rotation_error(matrix)
         require(
             np.asarray(good) | np.isnan(size),
