@@ -174,7 +174,7 @@ class Scan(NamedTuple):
                 jnp.asarray(np.pad(t, (0, missing))),
                 jnp.asarray(np.pad(rows, ((0, 0), (0, missing)))),
                 step,
-                _filled_up(2 * (most * count + 1)),
+                _padded_size(2 * (most * count + 1)),
             )
         )
         window, data, columns = map(jnp.asarray, (transforms[0], transforms[1], transforms[2:]))
@@ -200,7 +200,7 @@ class Scan(NamedTuple):
         ``soft`` (..., m), times the number of points, is added to the diagonal of the normal
         equations.
         """
-        chunk = min(_CHUNK, _filled_up(len(nodes)))
+        chunk = min(_CHUNK, _padded_size(len(nodes)))
         whole = np.concatenate([nodes, np.repeat(nodes[-1:], -len(nodes) % chunk, 0)])
         power, size = np.empty((2, len(whole)))
         # Two sums of a pair may share a node, or be zero: the ridge makes the matrix regular. With
@@ -322,7 +322,7 @@ def fourier_lattices(
     return scan.pairs(g, h, power[index])
 
 
-def _filled_up(count: int) -> int:
+def _padded_size(count: int) -> int:
     """The next power of two, at least 256: a padded size that many light curves share."""
     return max(1 << (count - 1).bit_length(), 256)
 
@@ -353,7 +353,7 @@ def _strong_lines(t, values, step) -> tuple[float, float]:
     count = max(int(min(limit / step, 4 * _MAX_LINE_NODES)), 8)
     missing = -len(t) % BLOCK
     t, values = np.pad(np.asarray(t, float), (0, missing)), np.pad(values, (0, missing))
-    (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, _filled_up(count))
+    (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, _padded_size(count))
     power = np.abs(np.asarray(table))[:count] ** 2
     strong = step * np.flatnonzero(power > 0.1 * power.max())[-1]
     strongest = step * int(np.argmax(power))

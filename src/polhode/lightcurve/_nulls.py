@@ -286,8 +286,8 @@ def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
     if curve.sun is None or curve.observer is None:
         return []
     # The columns linear and quadratic in the phase angle absorb the light of a sphere by the law.
-    arrays, basis = _filled_up(linear, curve.sun, curve.observer)
-    longitude, latitude = _directions(12)
+    arrays, basis = _padded_arguments(linear, curve.sun, curve.observer)
+    longitude, latitude = _spiral_directions(12)
     turn = np.pi * np.arange(4) / 4
     grid = np.array(
         [
@@ -325,7 +325,7 @@ def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
     return sorted(out, key=lambda r: r.chi2)
 
 
-def _filled_up(linear: Linear, sun: np.ndarray, observer: np.ndarray):
+def _padded_arguments(linear: Linear, sun: np.ndarray, observer: np.ndarray):
     """Arguments of `_rotators`, padded with points of zero weight and columns of zeros, so that one
     program serves many light curves."""
     n, priors, columns = linear.t.size, len(linear.rows) - linear.t.size, linear.basis.shape[1]
@@ -357,11 +357,11 @@ def round_rotators(periods) -> list[np.ndarray]:
     return [
         np.array([-0.05, -0.2, longitude, latitude, 0.0, 1 / period])
         for period in periods
-        for longitude, latitude in zip(*_directions(_ROUND), strict=True)
+        for longitude, latitude in zip(*_spiral_directions(_ROUND), strict=True)
     ]
 
 
-def _directions(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _spiral_directions(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Longitudes and latitudes (count,) [rad], evenly distributed on the sphere along a spiral."""
     k = np.arange(count) + 0.5
     return np.pi * (1 + 5**0.5) * k, np.arcsin(1 - 2 * k / count)
@@ -383,10 +383,10 @@ def _improve_rotators(x, arrays, basis, steps: int = 25):
         step *= np.minimum(1, 0.5 / np.maximum(np.abs(step[:, :5]).max(1), 1e-30))[:, None]
         trial = x - step
         new, new_slopes = map(np.asarray, _rotators(trial, arrays, basis))
-        prior_precision = prior_precision[0, 0]
+        axis_precision = prior_precision[0, 0]
 
-        def cost(value, x, prior_precision=prior_precision):
-            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + prior_precision * (
+        def cost(value, x, axis_precision=axis_precision):
+            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + axis_precision * (
                 x[:, :2] ** 2
             ).sum(1)
 

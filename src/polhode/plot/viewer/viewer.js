@@ -309,7 +309,7 @@ function start() {
     const box = line.querySelector("input");
     box.checked = !motion.hidden.includes(name);
     const set = () => objects.forEach((one) => { one.visible = box.checked; });
-    box.addEventListener("change", () => { set(); ask(); });
+    box.addEventListener("change", () => { set(); requestDraw(); });
     byId("keys").append(line);
     set();
   }
@@ -321,7 +321,7 @@ function start() {
   slider.max = last;
   for (const factor of [0.1, 0.25, 0.5, 1, 2, 4, 10])
     speed.add(new Option(factor + " ×", factor, factor === 1, factor === 1));
-  let now = 0, playing = false, before = null, asked = false;
+  let now = 0, playing = false, before = null, isRequested = false;
   const ICONS = {
     true: '<svg width="14" height="14"><rect x="1" width="4" height="14"/><rect x="9" width="4" height="14"/></svg>',
     false: '<svg width="14" height="14"><path d="M3 0 L14 7 L3 14 Z"/></svg>',
@@ -331,7 +331,7 @@ function start() {
     before = null;
     play.innerHTML = ICONS[playing];
     play.title = playing ? "pause" : "play";
-    ask();
+    requestDraw();
   };
   play.addEventListener("click", () => {
     if (!playing && now >= last) now = 0;
@@ -341,7 +341,7 @@ function start() {
   window.addEventListener("keydown", (event) => {
     if (event.key === " " && event.target === document.body) play.click();
   });
-  controls.addEventListener("change", () => ask());
+  controls.addEventListener("change", () => requestDraw());
   // page.html#t=12.5 opens at the time 12.5, in the time unit of the page
   const fromAddress = () => {
     const found = /[#&]t=([-+.\deE]+)/.exec(location.hash);
@@ -367,7 +367,7 @@ function start() {
     cells.style.gridAutoRows = "minmax(0, 1fr)";
     for (const cell of cells.children) cell.classList.toggle("tall", best.tall);
     renderer.setSize(width, height);
-    ask();
+    requestDraw();
   }
 
   function draw() {
@@ -394,21 +394,21 @@ function start() {
     }
   }
 
-  function ask() {
-    if (!asked) {
-      asked = true;
+  function requestDraw() {
+    if (!isRequested) {
+      isRequested = true;
       requestAnimationFrame(step);
     }
   }
   function step(clock) {
-    asked = false;
+    isRequested = false;
     if (playing) {
       if (before !== null) now += (clock - before) / 1000 * motion.pace * Number(speed.value);
       before = clock;
       if (now > last) now %= last;
     }
     draw();
-    if (playing) ask();
+    if (playing) requestDraw();
   }
 
   new ResizeObserver(layout).observe(stage);
