@@ -1,4 +1,5 @@
-// The page of polhode.plot.view: reads the motion from the page, draws it with three.js at the time of the slider.
+// The page of polhode.plot.view: reads the motion from the page, draws it with three.js at the time
+// of the slider.
 (function () {
 "use strict";
 const motion = JSON.parse(document.getElementById("motion").textContent);
