@@ -212,4 +212,4 @@ def test_rounding_of_smooth_torques_in_single_precision_is_carried_along():
     gap = rotation.angle_between(single.wxyz[-1].astype(float), exact.wxyz[-1])
     assert gap < 10 * 1e-5 + float(np.finfo(np.float32).eps) * 200**1.5  # of 200 rad
     explained = str(ph.explain(*found(np.float32)))
-    assert "extrapolated midpoint rule, its rounding carried along\n" in explained
+    assert "extrapolated midpoint rule, with compensated summation\n" in explained

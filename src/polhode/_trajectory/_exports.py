@@ -205,7 +205,7 @@ def _rows(wxyz: np.ndarray, omega: np.ndarray) -> Iterator[str]:
     """Rows Q1 Q2 Q3 QC of the transformation A to B (space to body components), rates in deg/s."""
     if not (np.isfinite(wxyz).all() and np.isfinite(omega).all()):
         raise ValueError(
-            "the samples hold NaN: write the bodies that arrived, traj[traj.successful]."
+            "the samples contain NaN: write only the bodies that finished, traj[traj.successful]."
         )
     xyzw = wxyz[:, [1, 2, 3, 0]]
     for row in np.concatenate([xyzw, np.rad2deg(omega)], axis=-1):

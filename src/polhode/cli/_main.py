@@ -156,7 +156,7 @@ def _report(error: Exception, debug: bool) -> int:
     bad_input = isinstance(error, SceneFileError | UsageError)
     text = str(error) or type(error).__name__
     if isinstance(error, MemoryError):
-        text = f"not enough memory ({text}): ask for fewer bodies or times, or use an [ensemble]"
+        text = f"not enough memory ({text}): use fewer bodies or times, or use an [ensemble]"
     expected = bad_input or isinstance(error, OSError | ImportError | RuntimeError | MemoryError)
     lead = "" if expected else f"{type(error).__name__}: "
     hint = "" if expected or debug else "\n  (run again with --debug to see where)"

@@ -134,7 +134,7 @@ ForceOption = Annotated[
 NoFigureOption = Annotated[bool, typer.Option("--no-figure", help="do not draw the figure")]
 NoCacheOption = Annotated[
     bool,
-    typer.Option("--no-cache", help="do not keep compiled programs (or set POLHODE_CACHE=off)"),
+    typer.Option("--no-cache", help="do not store compiled programs (or set POLHODE_CACHE=off)"),
 ]
 QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="print errors only")]
 DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceback of an error")]

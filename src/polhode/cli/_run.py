@@ -46,7 +46,7 @@ def _ensemble_option(name: str, metavar: str, words: str, parser: Any = None) ->
 
 MemoryOption = Annotated[
     int | None,
-    _ensemble_option("--memory", "SIZE", "memory to stay within, such as 2GB", byte_count),
+    _ensemble_option("--memory", "SIZE", "limit of memory, such as 2GB", byte_count),
 ]
 ChunkOption = Annotated[
     int | None,

@@ -322,7 +322,7 @@ class AngleDraw(Draw):
 
 class AttitudeDraw(AngleDraw):
     one_of = (("sigma", "half_width", "any"),)
-    any: Literal[True] | None = Field(None, description="true: every attitude alike")
+    any: Literal[True] | None = Field(None, description="true: all attitudes equally probable")
 
 
 class RatesDraw(Draw):

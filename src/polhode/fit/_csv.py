@@ -116,7 +116,7 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
     ]
     if missing_columns:
         raise ValueError(
-            f"{path} must have the columns asked for, missing: {', '.join(missing_columns)}; its "
+            f"{path} lacks requested columns: {', '.join(missing_columns)}; its "
             f"columns are: {', '.join(names) or 'none'}{_headless(names)}."
         )
     shared = [name for name in header_names.values() if [*header_names.values()].count(name) > 1]

@@ -52,8 +52,8 @@ WARNINGS = {
     Finding.CALIBRATION: "scale factors, misalignment or bias of the gyroscope are more than 3.5"
     " standard deviations from its calibration: state a wider one, Gyroscope(scale_std=...,"
     " misalignment_std=...), or the model lacks something that they make up for",
-    Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may ask for"
-    " a value beyond",
+    Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may fit a"
+    " value beyond better",
 }
 SCENE_WARNINGS = WARNINGS | {
     Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"

@@ -273,7 +273,7 @@ def fit_scene(
     for name in ("motion", "unknown", "initial_inertia"):
         require(
             getattr(options, name) is None,
-            f"fit_scene has no use for the option {name}: the scene is the model, and free selects"
+            f"fit_scene does not use the option {name}: the scene is the model, and free selects"
             " what is unknown.",
         )
     require(

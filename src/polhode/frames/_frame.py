@@ -343,7 +343,7 @@ class RotatingFrame(eqx.Module):
         if not callable(attitude):
             raise TypeError(
                 f"attitude must be a function of time, got {type(attitude).__name__}: for a frame"
-                " that turns steadily use RotatingFrame.from_rate."
+                " of constant angular velocity use RotatingFrame.from_rate."
             )
         name = "RotatingFrame.from_attitude"
         takes(name, attitude, ("t",))

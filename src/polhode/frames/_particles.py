@@ -80,7 +80,7 @@ def _pushed(force, t, position, velocity):
         value = jnp.asarray(force.function(*arguments))
         return jnp.broadcast_to(value, position.shape) if value.shape == (3,) else value
 
-    hint = "It sees all particles at one time."
+    hint = "It receives all particles at one time."
     shape, dtype = position.shape, position.dtype
     return result_of(name, _ARGUMENTS, broadcast_force, shape, dtype, *arguments, hint=hint)
 
@@ -192,7 +192,7 @@ def simulate_particles(
     if not isinstance(force, FrameForce | SpaceForce | None):
         raise TypeError(
             f"force must be None, FrameForce(function) or SpaceForce(function), got"
-            f" {type(force).__name__}: the class tells in which axes the function works."
+            f" {type(force).__name__}: the class states the axes of the force."
         )
     solver = diffrax.Dopri8() if solver is None else solver
     check_options(solver, controller, adjoint, max_steps=max_steps)

@@ -429,7 +429,7 @@ def check_moments(name: str, moments: np.ndarray, slack: float, zero_fraction: f
         smallest > zero_fraction * largest,
         lambda: (
             f"{name} must be positive (kg m^2), got {_worst(moments, smallest)}; a moment is zero"
-            " only for a point or a thin line, which cannot turn about itself: give it a width."
+            " only for a point or an infinitely thin line: give the body a width."
         ),
     )
     excess = 2 - sum(x / largest for x in columns)  # relative, so that nothing overflows

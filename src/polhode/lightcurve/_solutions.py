@@ -374,7 +374,10 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
             "Sun and observer stay near one plane: poles mirrored in it fit nearly as well."
         )
     if np.degrees(curve.alpha.max()) < 3:
-        notes.append("All phase angles are below 3 deg: poles are known up to turns about the ray.")
+        notes.append(
+            "All phase angles are below 3 deg: poles are known only up to a rotation"
+            " about the line of sight."
+        )
     span = np.ptp(curve.t)
     best = solutions[0]
     for name, period in (("P_phi", best.P_phi), ("P_psi", best.P_psi)):
@@ -398,8 +401,8 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
         )
     if scale**2 > REACHED:
         notes.append(
-            f"Residuals are {scale:.1f} times the errors assumed: the body is not the whole truth,"
-            " and errors follow from the residuals; trust none to better than a factor of two."
+            f"Residuals are {scale:.1f} times the errors assumed: the model is incomplete, and"
+            " errors follow from the residuals: they are uncertain by a factor of two."
         )
     if alike > 1:
         notes.append(

@@ -243,7 +243,7 @@ def _table(ax, data):
         f"over the noise {data['chi']:.3g}",
         f"whiteness      p = {data['white']:.2g}",
         "scale          " + ("known" if data["scale_known"] else "not shown by free motion"),
-        "remarks        " + (", ".join(data["findings"]) or "none"),
+        "findings       " + (", ".join(data["findings"]) or "none"),
     ]
     _write_lines(ax, lines)
 
