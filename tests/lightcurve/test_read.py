@@ -249,6 +249,15 @@ def test_unsorted_times_are_sorted_with_their_points():
     np.testing.assert_allclose(curve.magnitude, 15 + curve.t)
 
 
+def test_times_that_a_precision_does_not_resolve_are_refused():
+    """A Julian date in single precision, JAX's default, is one of a quarter of a day."""
+    t = 2459000.5 + 0.15 * np.arange(40.0)
+    with pytest.raises(ValueError, match=r"in float32 are resolved to 0\.25 d only"):
+        lightcurve.LightCurve.of(t.astype(np.float32), np.sin(t))
+    since = (t - t[0]).astype(np.float32)
+    np.testing.assert_array_equal(lightcurve.LightCurve.of(since, np.sin(t)).t, since)
+
+
 def test_nothing_of_a_file_is_dropped_in_silence(tmp_path):
     rows = [(t, m, m + 1) for t, m in zip(JD, MAGNITUDE)]
     with pytest.raises(ValueError, match="more than one column mag"):
