@@ -129,6 +129,8 @@ def test_alcdef(tmp_path):
     vectors.write_text(
         "\n".join([header, f"{ends[0]},2,0,0,0,1.5,0", f"{ends[1] + 1},2,0,0,0,1.5,0"])
     )
+    notes = " ".join(lightcurve.read_light_curve(path).notes)
+    assert "times of some sessions keep their light time, those of others are corrected" in notes
     curve = lightcurve.read_light_curve(path, vectors)
     moved = np.where(curve.group == 0, LIGHT_TIME * 1.5, 0)
     np.testing.assert_allclose(curve.t + moved, [*np.sort(JD), *(np.sort(JD) + 1)], atol=1e-9)
