@@ -243,9 +243,9 @@ def interpolate_gaps(
 def stack(recordings: Sequence[Recording]) -> Recording:
     """One recording with a leading axis from several; shorter ones are filled up with gaps.
 
-    These gaps last no longer than the last interval of a recording: what acts on the body may not
-    be known later. Raises ValueError for recordings that have batch axes or different kinds of
-    data.
+    These gaps last as long as the last interval of a recording, of more than a thousand each a
+    thousandth of it: what acts on the body may not be known later. Raises ValueError for recordings
+    that have batch axes or different kinds of data.
     """
     if isinstance(recordings, Recording) or not all(isinstance(r, Recording) for r in recordings):
         raise TypeError("recordings must be a list of Recording objects: [Recording.of(...), ...].")
@@ -265,8 +265,9 @@ def stack(recordings: Sequence[Recording]) -> Recording:
             r.times.dtype
         )
         last_interval = r.times[-1] - r.times[-2]
-        # of which times that are large have digits
-        smallest = 64 * jnp.finfo(r.times.dtype).eps * jnp.abs(r.times[-1])
+        # of which large times have digits, and differences of the motion
+        digits = 64 * jnp.finfo(r.times.dtype).eps * jnp.abs(r.times[-1])
+        smallest = jnp.maximum(digits, 1e-3 * last_interval)
         interval = jnp.clip(last_interval / missing_count, smallest, last_interval)
         longer = jax.tree.map(
             lambda array: jnp.concatenate([array, jnp.repeat(array[-1:], missing_count, axis=0)]), r
