@@ -1,6 +1,7 @@
 """Results of fits as dictionaries, JSON, CSV and figures; what limits them."""
 
 import csv
+import dataclasses
 import json
 
 import equinox as eqx
@@ -145,6 +146,28 @@ def test_a_figure_of_a_batch_needs_its_recording(of_inertia):
     times = np.linspace(0.0, 20.0, 60)
     with pytest.raises(ValueError, match=r"leading axes \(2,\), got \(\)"):
         plot.fit(batch, Recording.of(times, np.ones((60, 3))), body=1)
+
+
+def test_a_figure_of_several_recordings_shows_the_first_and_no_model_at_a_limit(of_inertia):
+    """The first one of a fit is shorter than another; a bound says nothing on the model."""
+    pytest.importorskip("matplotlib")
+    times = np.linspace(0.0, 20.0, 60)[:50]
+    rates = np.asarray(ph.simulate(ph.Scene(BODY), STATE, times).omega_body)
+    limit = rates[:, 0].max() - 0.01
+    recording = Recording.of(times, np.minimum(rates, limit), omega_noise=NOISE)
+    at_limit = np.zeros((50, 3))
+    at_limit[:, 0] = rates[:, 0] > limit
+    recording = dataclasses.replace(recording, saturated=jnp.asarray(at_limit))
+    residual = np.zeros((1, 60, 3))
+    residual[0, :50] = np.where(at_limit, 0, 0.5)
+    fit = eqx.tree_at(lambda f: f.residuals["omega"], of_inertia, jnp.asarray(residual))
+    shown = _single(fit, recording, 0)["model"]
+    expected = np.where(at_limit, np.nan, recording.omega - 0.5 * NOISE)
+    assert 0 < at_limit.sum() < 20
+    np.testing.assert_allclose(shown, expected)
+    other = Recording.of(times[:40], rates[:40], omega_noise=NOISE)
+    with pytest.raises(ValueError, match="the first of those that were fitted, got one of 40"):
+        plot.fit(fit, other)
 
 
 def test_a_figure_of_a_fitted_scene(of_scene):

@@ -15,6 +15,7 @@ from polhode.fit import (
     fit_inertia,
     stack,
 )
+from polhode.fit._options import median_step
 from polhode.fit._start import regression
 from polhode.inertia import inertia_of_second_moments, is_physical
 
@@ -240,6 +241,19 @@ def test_recordings_of_different_length_stack():
     both = stack([one, two])
     assert both.times.shape == (2, 5)
     np.testing.assert_array_equal(both.present, [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
+
+
+@pytest.mark.parametrize("epoch", [0.0, 1.7e9])
+def test_gaps_that_fill_a_recording_up_end_within_an_interval(epoch):
+    """A table of a torque, or the motion itself, may end with the recording."""
+    short = Recording.of(epoch + np.arange(4.0), np.ones((4, 3)))
+    long = Recording.of(np.arange(100.0), np.ones((100, 3)))
+    times = np.asarray(stack([short, long]).times[0])
+    np.testing.assert_array_equal(times[:4], epoch + np.arange(4.0))
+    assert np.all(np.diff(times) > 0)
+    assert times[-1] <= epoch + 4.0
+    # a noise density refers to the interval between samples
+    np.testing.assert_allclose(median_step(stack([short, long])), 1)
 
 
 @pytest.mark.slow  # faster: gaps, test_gaps_are_left_out

@@ -255,6 +255,20 @@ def test_optima_at_a_bound_are_found():
     assert np.all(quadratic < 0.1)
 
 
+@pytest.mark.parametrize("given", [None, np.ones((6, 3))])
+def test_fitted_values_of_a_table_have_their_own_derivatives(given):
+    """Not those of the values from which the fit starts, unless they were given."""
+    times = np.linspace(0.0, 5.0, 6)
+    start = ph.Table(times, np.zeros((6, 3)), derivatives=given)
+    scene = ph.Scene(BODY, torque=ph.BodyTorque(start))
+    motion = LeafMotion(scene, places_of(scene, lambda s: s.torque.n.values))
+    values = np.sin(times)[:, None] * np.array([1.0, 2.0, 3.0])
+    fitted = motion.with_values([jnp.asarray(values)]).torque.n
+    expected = ph.Table(times, values, derivatives=given)
+    np.testing.assert_allclose(fitted(1.7), expected(1.7), rtol=1e-14)
+    assert fitted.has_kinks == expected.has_kinks
+
+
 def test_values_between_bounds_and_numbers_that_may_be_anything():
     """The transformation and its inverse for two bounds, one and none; derivatives do not vanish
     far beyond a bound.

@@ -92,6 +92,7 @@ def test_euler_sequences_agree_with_scipy():
         ("stop = 2.0\nnumber = 5", "values = [0, 0]", "[times] values", "sort them"),
         ("stop = 2.0\nnumber = 5", "values = [1]", "[times] values", "at least 2 items"),
         ("stop = 2.0\nnumber = 5", "values = [1, 2]\nstop = 3", "[times]", "exactly one of"),
+        ("number = 5", "number = 5\nstep = 0.5", "[times]", "got both: remove one of them"),
         ("number = 5", "number = 5.5", "[times] number", "a valid integer"),
         ("number = 5", "number = true", "[times] number", "a valid integer"),
         ("number = 5", "number = 1", "[times] number", "greater than or equal to 2"),

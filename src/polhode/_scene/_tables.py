@@ -50,6 +50,7 @@ class Table(AbstractPart):
 
     order: int = eqx.field(static=True)
     is_number: bool = eqx.field(static=True)
+    has_given_derivatives: bool = eqx.field(static=True)
     times: Float[Array, " n"]
     values: Float[Array, "*#b n k"] = shaped(None, None)
     derivatives: Float[Array, "*#b n k"] | None = shaped(None, None)
@@ -88,11 +89,11 @@ class Table(AbstractPart):
         self.values = array[..., None] if self.is_number else array
         knots = self.times.astype(array.dtype)
         self.derivatives, self.has_kinks = None, jnp.ones((), array.dtype)
+        self.has_given_derivatives = derivatives is not None
         if order == 1:
             return
         if derivatives is None:
-            self.derivatives = _derivatives(self.values, knots)
-            self.has_kinks = _has_kinks(self.values, self.derivatives, knots)
+            self.derivatives, self.has_kinks = _interpolation(self.values, knots)
             return
         derivative_array = as_float_array("Table derivatives", derivatives)
         core = 1 if self.is_number else 2
@@ -107,6 +108,13 @@ class Table(AbstractPart):
             jnp.broadcast_to(x, (*lead, *x.shape[-2:])) for x in (self.values, columns)
         )
         self.has_kinks = _has_kinks(self.values, self.derivatives, knots)
+
+    def updated(self) -> "Table":
+        """The table with derivatives of the values that it has now, such as fitted ones."""
+        if self.order == 1 or self.has_given_derivatives:
+            return self
+        parts = _interpolation(self.values, self.times.astype(self.values.dtype))
+        return eqx.tree_at(lambda table: (table.derivatives, table.has_kinks), self, parts)
 
     @property
     def input_conditions(self) -> tuple[Array, ...]:
@@ -234,6 +242,12 @@ def _derivatives(values: Array, times: Array) -> Array:
         rows = values[..., first_index + j, :]
         total = total + weight.reshape((1,) * (values.ndim - 2) + weight.shape) * rows
     return total
+
+
+def _interpolation(values: Array, times: Array) -> tuple[Array, Array]:
+    """``derivatives`` and ``has_kinks`` of a cubic table of these values."""
+    derivatives = _derivatives(values, times)
+    return derivatives, _has_kinks(values, derivatives, times)
 
 
 _NEGLIGIBLE = 1e-9

@@ -25,7 +25,7 @@ from polhode._hamiltonian import (
 from polhode._hamiltonian._energy import from_rows
 from polhode._integrate import LiePoisson
 from polhode._method import AbstractMethod
-from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping, Scene, State
+from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping, Scene, State, Table
 from polhode._simulate import simulate
 from polhode.fit._numerics import ClassicalRungeKutta, inverse, to_bounded, to_unbounded
 from polhode.inertia import Inertia, inertia_of_second_moments, principal
@@ -568,7 +568,13 @@ class LeafMotion(AbstractMotion):
         leaves, tree = jax.tree.flatten(self.scene)
         for i, value in zip(self.places, values, strict=True):
             leaves[i] = value.astype(leaves[i].dtype)
-        return jax.tree.unflatten(tree, leaves)
+        scene = jax.tree.unflatten(tree, leaves)
+        # derivatives of tables follow from the values, as in their constructor
+        return jax.tree.map(
+            lambda part: part.updated() if isinstance(part, Table) else part,
+            scene,
+            is_leaf=lambda part: isinstance(part, Table),
+        )
 
     def __call__(
         self,

@@ -190,7 +190,7 @@ def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
     if gyroscope.bias is not None:
         omega = omega - jnp.broadcast_to(gyroscope.bias.astype(dtype), omega.shape)
     if gyroscope.noise_density:
-        step = jnp.median(jnp.diff(recording.times, axis=-1), axis=-1)[..., None, None]
+        step = median_step(recording)[..., None, None]
         noise = jnp.broadcast_to(gyroscope.noise_density / step**0.5, omega.shape)
     present = recording.present
     if gyroscope.gain is not None:
@@ -209,6 +209,13 @@ def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
     return dataclasses.replace(
         recording, omega=omega, omega_noise=noise, saturated=limits, present=present
     )
+
+
+def median_step(recording: Recording) -> Float[Array, "*b"]:
+    """Median interval that ends at a sample: others may end at gaps that fill a recording up."""
+    steps, is_sample = jnp.diff(recording.times, axis=-1), recording.present[..., 1:] > 0
+    is_sample = is_sample | ~jnp.any(is_sample, axis=-1, keepdims=True)
+    return jnp.nanmedian(jnp.where(is_sample, steps, jnp.nan), axis=-1)
 
 
 def _limits_of_rates(limits: Array, present: Array, back: Array) -> tuple[Array, Array]:

@@ -243,7 +243,9 @@ def interpolate_gaps(
 def stack(recordings: Sequence[Recording]) -> Recording:
     """One recording with a leading axis from several; shorter ones are padded with gaps.
 
-    Raises ValueError for recordings that have batch axes or different kinds of data.
+    The gaps of a recording together last one interval between samples (more than a thousand gaps: a
+    thousandth of it each), since a torque may not be known later. Raises ValueError for recordings
+    that have batch axes or different kinds of data.
     """
     if isinstance(recordings, Recording) or not all(isinstance(r, Recording) for r in recordings):
         raise TypeError("recordings must be a list of Recording objects: [Recording.of(...), ...].")
@@ -262,12 +264,17 @@ def stack(recordings: Sequence[Recording]) -> Recording:
         steps = jnp.maximum(jnp.arange(longest) - (longest - missing_count - 1), 0).astype(
             r.times.dtype
         )
+        last_interval = r.times[-1] - r.times[-2]
+        # of which large times have digits, and differences of the motion
+        digits = 64 * jnp.finfo(r.times.dtype).eps * jnp.abs(r.times[-1])
+        smallest = jnp.maximum(digits, 1e-3 * last_interval)
+        interval = jnp.clip(last_interval / missing_count, smallest, last_interval)
         longer = jax.tree.map(
             lambda array: jnp.concatenate([array, jnp.repeat(array[-1:], missing_count, axis=0)]), r
         )
         return dataclasses.replace(
             longer,
-            times=longer.times + steps * (r.times[-1] - r.times[-2]),
+            times=longer.times + steps * interval,
             present=jnp.where(steps > 0, 0, longer.present),
         )
 

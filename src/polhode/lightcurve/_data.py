@@ -76,9 +76,11 @@ class LightCurve(NamedTuple):
         for light time; ``reduced``: 5 log10(r Delta) is already subtracted. ``sigma``: standard
         deviations [mag], 0 or NaN: unknown. ``group`` (n,): names of nights or observers.
         ``calibrated``: groups share a zero point but for small errors. Raises ValueError for shapes
-        that differ, values not finite, negative ``sigma``, and times that are all the same.
+        that differ, values not finite, negative ``sigma``, and times that are all the same or whose
+        precision is too low for their intervals.
         """
-        t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
+        given_times = np.asarray(t)
+        t, magnitude = given_times.astype(float), np.asarray(magnitude, float)
         if t.ndim != 1 or t.shape != magnitude.shape or t.size < FEWEST_POINTS:
             raise ValueError(
                 f"a light curve needs at least {FEWEST_POINTS} times and as many magnitudes, got"
@@ -94,6 +96,7 @@ class LightCurve(NamedTuple):
             )
         if np.ptp(t) == 0:
             raise ValueError(f"all {t.size} times are {t[0]}: a light curve must span some time.")
+        _require_digits(given_times)
         if (sun is None) != (observer is None):
             raise ValueError("give both the vectors to the Sun and to the observer, or neither.")
         if sun is not None:
@@ -294,6 +297,19 @@ class LightCurve(NamedTuple):
 def has_distances(lengths: np.ndarray) -> bool:
     """Whether vectors of these lengths state distances, in contrast to unit vectors."""
     return bool(np.abs(lengths - 1).max() > _ROUNDED)
+
+
+def _require_digits(times: np.ndarray) -> None:
+    """ValueError for times (n,) of which the dtype does not resolve the intervals to a tenth."""
+    if times.dtype.kind != "f" or times.dtype.itemsize >= 8:
+        return
+    resolution = float(np.spacing(np.abs(times).max()))
+    if resolution > 0.1 * np.median(np.diff(np.unique(times.astype(float)))):
+        raise ValueError(
+            f"times of up to {np.abs(times).max():.8g} d in {times.dtype} are resolved to"
+            f" {resolution:.2g} d only: give them in float64 (of NumPy, or of JAX with"
+            " jax_enable_x64)."
+        )
 
 
 def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]:

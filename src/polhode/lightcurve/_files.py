@@ -289,14 +289,21 @@ def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve
     are_numbers = all(all(_is_number(x) for x in ray) for ray in rays)
     sun = observer = None
     nights = "" if calibrated else "nights have free offsets, "
-    notes = [f"ALCDEF gives no distances: {nights}times keep their light time."]
+    at_body, is_reduced = np.array(applied).T
+    times = "times are corrected for light time."
+    if not at_body.all():
+        times = "times keep their light time."
+    if at_body.any() and not at_body.all():
+        times = (
+            "times of some sessions keep their light time, those of others are corrected for it."
+        )
+    notes = [f"ALCDEF gives no distances: {nights}{times}"]
     if vectors is not None:
         six = _interpolated(vectors, data[:, 0])
         sun, observer, notes = six[:, :3], six[:, 3:], []
         r, delta = (np.linalg.norm(v, axis=1) for v in (sun, observer))
         # undo corrections of the file, which ``LightCurve.of`` applies to all points
         if has_distances(delta):
-            at_body, is_reduced = np.array(applied).T
             data[:, 0] += np.where(at_body, LIGHT_TIME * delta, 0)
             data[:, 1] += np.where(is_reduced & (not reduced), 5 * np.log10(r * delta), 0)
     elif are_numbers:

@@ -20,12 +20,12 @@ _LONGEST, _ROWS = 18, 10
 def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     """Returns a figure of a ``fit.Fit`` and its ``fit.Recording``.
 
-    Left: rates of the first recording (dots) and of the fitted motion (lines), and the residuals in
-    units of their noise.
+    Left: rates of the first recording (dots) and of the fitted motion (lines, interrupted
+    where a reading is at the limit of the gyroscope), and the residuals in units of their noise.
     Right, for an inertia: the confidence region of the two smaller ratios (or moments), and the
     limit of physical bodies; for a scene: the correlations of the fitted numbers. Below, a table of
     the results. ``body``: index in a batch. Raises ValueError for a recording without rates, or
-    whose leading axes differ from those of a batch of fits.
+    whose leading axes or number of samples differ from those of the fit.
     """
     if recording.omega is None:
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
@@ -91,9 +91,18 @@ def _single(result, recording, body) -> dict[str, Any]:
     omega, noise = (pick(x, 2, place) for x in (recording.omega, recording.omega_noise))
     present, times = (pick(x, 1, place) for x in (recording.present, recording.times))
     present = present > 0
-    residual = pick(result.residuals["omega"], 3)[0]
+    residual, count = pick(result.residuals["omega"], 3)[0], times.size
+    # shorter recordings of a fit are filled up with gaps, whose residuals are zero
+    if count > len(residual) or np.any(residual[count:]):
+        raise ValueError(
+            f"recording must be the first of those that were fitted, got one of {count} samples."
+        )
+    residual = residual[:count]
     # these residuals are those before the robust loss, so that this is the fitted motion
     model = omega - residual * noise
+    if recording.saturated is not None:  # a bound that holds does not tell where the model is
+        limits = pick(recording.saturated, 2, place)
+        model = np.where((limits != 0) & (residual == 0), np.nan, model)
     hole = np.where(present, 1.0, np.nan)[:, None]
     shared = {
         "times": times,

@@ -335,10 +335,10 @@ def overview(
     """A figure of the first body, with the distribution of the others, and observations.
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body
-    rates, with lines for body 0 and bands from the 5th to the 95th percentile of the others, or
-    thin lines of up to 64 of them if the bodies have different times; dots are `observed`
-    (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or the energy
-    of a body that starts at rest, did not finish, or has a variable inertia.
+    rates, with lines for body 0 and, for at least two others, bands from their 5th to their 95th
+    percentile, or thin lines of up to 64 of them if the bodies have different times; dots are
+    `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or
+    the energy of a body that starts at rest, did not finish, or has a variable inertia.
     """
     data = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
