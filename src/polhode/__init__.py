@@ -1,7 +1,7 @@
 """polhode: rotating rigid bodies in JAX (simulate, differentiate, identify).
 
 The public names are listed in `__init__.pyi` and imported at first use, so that the command line
-answers, and errors in scene files are reported, before JAX is loaded.
+starts, and errors in scene files are reported, before JAX is loaded.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Files written whole or not at all: beside the target, synced, then renamed."""
+"""Atomic writing of files: a temporary file beside the target is synced and then renamed."""
 
 import contextlib
 import os
@@ -9,14 +9,14 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomic_write(target: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path in the folder of `target` that replaces `target` when the block succeeds.
+    """A temporary path in the folder of `target`; it replaces `target` if the block succeeds.
 
-    When the block raises anything, KeyboardInterrupt included, the temporary file is removed and an
-    existing `target` is left as it was. The folder must exist. An OSError of the system names the
-    target and its folder.
+    If the block raises, KeyboardInterrupt included, the temporary file is removed and an existing
+    `target` is not changed. The folder must exist. An OSError of the operating system is raised
+    with a message that names the target and its folder.
     """
     target = Path(target).resolve()
-    # the suffix stays last: writers of figures choose the format by it
+    # the suffix is last, because functions that write figures choose the format by it
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}.part{target.suffix}")
     try:
         yield temporary
@@ -39,7 +39,7 @@ def atomic_write(target: str | os.PathLike) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Have a file, or the names in a folder, on the disk, also when the power goes."""
+    """Write a file, or the names in a folder, to the disk, so that they survive a power failure."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

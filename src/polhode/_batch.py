@@ -1,9 +1,9 @@
-"""Batches: leading axes of every array are broadcast, flattened to one axis of N lanes, and
-put back; a batch that lies on several devices is moved where it lies. Bodies and times are chosen
-by keys.
+"""Batches: the leading axes of all arrays are broadcast and flattened to one axis of N lanes; the
+results get the batch axes again. Each device simulates its own part of a batch that is sharded over
+several devices. Trajectories are indexed by keys for bodies and times.
 
-A part (inertia, state, potential, ...) tells the rank that each of its array fields has without
-batch axes in ``core_ranks``; parts made of other parts keep them in ``terms``.
+``core_ranks`` of a part (inertia, state, potential, ...) contains the rank of each of its array
+fields without batch axes; the ``terms`` of a sum are parts themselves.
 """
 
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def _lead(array, rank: int) -> tuple[int, ...]:
 
 
 def map_arrays(part: Any, fn: Callable[[Any, int], Any]) -> Any:
-    """The part with ``fn(array, core_rank)`` in place of each of its batched array fields."""
+    """The part with each of its array fields replaced by ``fn(array, core_rank)``."""
     if part is None:
         return None
     if isinstance(part, AbstractSum):
@@ -64,7 +64,8 @@ def batch_shapes(part: Any) -> list[tuple[int, ...]]:
 
 
 def common_batch(*parts: Any, extra: tuple[tuple[int, ...], ...] = ()) -> tuple[int, ...]:
-    """The batch shape that all parts broadcast to; ValueError names the shapes otherwise."""
+    """The batch shape to which all parts broadcast; raises ValueError with the shapes if there is
+    none."""
     shapes = [shape for part in parts for shape in batch_shapes(part)] + list(extra)
     try:
         return np.broadcast_shapes(*shapes)
@@ -81,7 +82,7 @@ def common_batch(*parts: Any, extra: tuple[tuple[int, ...], ...] = ()) -> tuple[
 
 
 def flatten(part: Any, batch: tuple[int, ...], *, shared: bool = True) -> Any:
-    """Arrays as (N, ...) lanes; with ``shared``, arrays of one body stay without batch axis."""
+    """Arrays as (N, ...) lanes; with ``shared``, arrays common to all bodies get no lane axis."""
 
     def to_lanes(x, rank):
         core = x.shape[x.ndim - rank :]
@@ -93,7 +94,7 @@ def flatten(part: Any, batch: tuple[int, ...], *, shared: bool = True) -> Any:
 
 
 def lane_times(ts: Array, batch: tuple[int, ...]) -> Array:
-    """Times (T,) as they are, those of each body (..., T) as (N, T)."""
+    """Common times (T,) unchanged, times of each body (..., T) as (N, T)."""
     if ts.ndim == 1:
         return ts
     return jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
@@ -123,34 +124,35 @@ def along_time(part: Any, batch_rank: int) -> Any:
     return map_arrays(part, expand)
 
 
-# Several devices. Chunks of lanes are worked on one after the other, which a compiler that splits
-# arrays by itself could only do by gathering them: the batch is split by hand, by jax.shard_map.
+# Several devices. The batch is divided explicitly by jax.shard_map: chunks of lanes are processed
+# one after another, and XLA's automatic partitioning would gather the arrays for this.
 
 
 class Split(NamedTuple):
-    """A mesh, and the mesh axes (None: whole) that each batch axis is divided among."""
+    """A mesh, and for each batch axis the mesh axes over which it is sharded (None: not
+    sharded)."""
 
     mesh: Mesh
     axes: tuple[Any, ...]
 
     def spec(self, array: Array, rank: int) -> PartitionSpec:
-        """How an array of core rank ``rank`` lies when its batch axes follow the split."""
+        """The ``PartitionSpec`` of an array of core rank ``rank`` whose batch axes are sharded."""
         lead = array.shape[: array.ndim - rank]
         axes = self.axes[len(self.axes) - len(lead) :]
         return PartitionSpec(*(a if size > 1 else None for a, size in zip(axes, lead)))
 
 
 def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
-    """How the batch of the inputs is divided among devices; None where it is not.
+    """How the batch of the inputs is divided among devices; None if it is not.
 
-    Looks at the ``NamedSharding`` of the arrays, or while they are traced, of their types (a mesh
-    with explicit axes). Raises ValueError when two arrays are divided differently.
+    It follows from the ``NamedSharding`` of the arrays, or of their types while they are traced (a
+    mesh with explicit axes). Raises ValueError if two arrays are divided differently.
     """
     if jax.device_count() == 1:
         return None
     shardings: list[tuple[NamedSharding, tuple[int, ...]]] = []
 
-    def look(x, rank):
+    def collect(x, rank):
         sharding = _sharding(x)
         if sharding is not None:
             shardings.append((sharding, x.shape[: x.ndim - rank]))
@@ -158,8 +160,8 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
 
     parts = [getattr(scene, name) for name in PARTS]
     for part in (*parts, state):
-        map_arrays(part, look)
-    look(ts, 1)
+        map_arrays(part, collect)
+    collect(ts, 1)
     if not shardings:
         return None
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
@@ -172,7 +174,7 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
                 continue
             if mesh not in (None, sharding.mesh) or axes[k] not in (None, axis):
                 raise ValueError(
-                    f"the arrays of a batch lie on their devices in different ways: axis {k} by"
+                    f"the arrays of a batch are sharded in different ways: axis {k} by"
                     f" {axes[k] or axis} and by {axis}, on {mesh} and {sharding.mesh}; place them"
                     " alike with jax.device_put."
                 )
@@ -192,7 +194,7 @@ def _typed(x: Any) -> Any:
 
 
 def place(split: Split, scene: Any, state: Any, ts: Array) -> tuple[Any, Any, Array]:
-    """All arrays where the split wants them; nothing moves that lies there already."""
+    """All arrays on the devices of the split; those that are there already are not moved."""
 
     def put(x, rank):
         return jax.device_put(x, NamedSharding(split.mesh, split.spec(x, rank)))
@@ -204,8 +206,8 @@ def place(split: Split, scene: Any, state: Any, ts: Array) -> tuple[Any, Any, Ar
 def on_devices(
     split: Split, fn: Callable, method: Any, scene: Any, state: Any, ts: Array, rtol: Array
 ) -> Any:
-    """``fn(method, scene, state, ts, rtol)`` by every device for its part of the batch; what it
-    returns has the batch axes in front.
+    """``fn(method, scene, state, ts, rtol)`` on every device for its part of the batch; all of its
+    results have the batch axes first.
     """
     arrays, static = eqx.partition((method, scene, state, ts, rtol), eqx.is_array)
     specs = jax.tree.map(lambda _: PartitionSpec(), arrays)
@@ -232,11 +234,11 @@ def _is_spec(x: Any) -> bool:
     return isinstance(x, PartitionSpec)
 
 
-# Keys: a trajectory is indexed as an array of samples, bodies first, then times.
+# Keys: a trajectory is indexed like an array of samples, bodies first, then times.
 
 
 def is_integer(key: Any) -> bool:
-    """Whether a key is one number, which takes an axis away."""
+    """Whether a key is a single integer, which removes an axis."""
     if isinstance(key, bool | np.bool_):
         return False
     if hasattr(key, "shape"):
@@ -245,7 +247,7 @@ def is_integer(key: Any) -> bool:
 
 
 def _entry(key: Any) -> Any:
-    """One entry of a key, lists as arrays."""
+    """One entry of a key; lists are converted to arrays."""
     if key is Ellipsis or isinstance(key, slice) or is_integer(key):
         return key
     array = key if isinstance(key, jax.Array) else np.asarray(key)
@@ -259,12 +261,12 @@ def _entry(key: Any) -> Any:
 
 
 def _axes_of(key: Any) -> int:
-    """Axes that an entry stands for."""
+    """Number of axes that an entry indexes."""
     return key.ndim if getattr(key, "dtype", None) == np.bool_ else 1
 
 
 def split_key(key: Any, rank: int) -> tuple[tuple[Any, ...], Any]:
-    """Entries of the ``rank`` axes of bodies, and the entry of the times."""
+    """The entries for the ``rank`` axes of bodies, and the entry for the times."""
     entries = [_entry(k) for k in (key if isinstance(key, tuple) else (key,))]
     dots = [i for i, k in enumerate(entries) if k is Ellipsis]
     count = sum(_axes_of(k) for k in entries if k is not Ellipsis)
@@ -282,13 +284,13 @@ def split_key(key: Any, rank: int) -> tuple[tuple[Any, ...], Any]:
 
 
 def ends_at_last(times: tuple[Any, ...]) -> bool:
-    """Whether the entry of the times chooses the last sample as its last one, whatever T is."""
+    """Whether the entry for the times selects the last sample as its last one, for any T."""
     (key,) = times
     return isinstance(key, slice) and key.stop is None and key.step in (None, 1)
 
 
 def check_key(key: Any, shape: tuple[int, ...], what: str) -> None:
-    """IndexError for a known key outside the shape, where JAX would take the nearest entry."""
+    """IndexError for a concrete key outside of the shape; JAX would take the nearest entry."""
     if not is_concrete(key):
         return
     concrete = key if isinstance(key, tuple) else (key,)

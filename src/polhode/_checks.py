@@ -1,4 +1,4 @@
-"""Input checks shared by every constructor: what was given, what is expected, how to fix it."""
+"""Input checks of all constructors; messages state the value, the requirement and the remedy."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -14,8 +14,8 @@ from jaxtyping import Array
 if TYPE_CHECKING:
     from jax.typing import ArrayLike as _ArrayLike
 
-    # What users write for numbers: arrays, numbers, and lists of them, nested up to matrices of a
-    # batch. JAX's own alias leaves lists out.
+    # Accepted numbers: arrays, scalars, and lists of them, nested up to a batch of matrices. The
+    # alias of JAX does not include lists.
     ArrayLike = (
         _ArrayLike
         | Sequence[_ArrayLike]
@@ -27,29 +27,29 @@ else:  # jaxtyping attaches shapes to array types only
 
 
 def is_concrete(*values: Any) -> bool:
-    """Whether every array leaf holds numbers now (is not being traced by jit, vmap or grad)."""
+    """Whether no array leaf is traced by jit, vmap or grad, so that all values are available."""
     return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
 
 
 def numbers(*arrays: Any) -> Any:
-    """NumPy for arrays with known values on the host, ``jax.numpy`` for others.
+    """NumPy for concrete arrays of this process, ``jax.numpy`` for others.
 
-    NumPy checks a few values without the dispatch of JAX, also while something else is traced."""
+    NumPy checks a few values without the dispatch of JAX, and while other arrays are traced."""
     return np if is_concrete(arrays) and all(_is_here(x) for x in arrays) else jnp
 
 
 def on_host(array: Any, weak: bool = False) -> Any:
-    """``array`` as a NumPy array where its values are known and it was not put on devices by hand.
+    """``array`` as a NumPy array if it is concrete and not committed to devices by the user.
 
-    A few operations on it then compile nothing. ``weak``: also of weakly typed numbers, which lose
-    that: their dtype no longer follows that of others."""
+    Operations on it then compile nothing. ``weak``: convert weakly typed arrays as well, which
+    makes their dtype strong."""
     if not isinstance(array, jax.Array) or not is_concrete(array) or array.committed:
         return array
     return np.asarray(array) if weak or not array.weak_type else array
 
 
 def together(conditions: Sequence[Any]) -> Any:
-    """Where all of these truth values (...) hold, batch axes broadcast; None for none."""
+    """Where all of these conditions (...) hold, with batch axes broadcast; None without any."""
     if not conditions:
         return None
     xp = numbers(*conditions)
@@ -63,14 +63,15 @@ def _is_here(x: Any) -> bool:
 def require(condition: Any, message: str | Callable[[], str]) -> None:
     """Raise ``ValueError(message)`` unless ``condition`` holds everywhere.
 
-    A function makes its message only then: to print numbers takes longer than most checks.
+    A message may be a function, which is called only then: to format numbers takes longer than most
+    checks.
     """
     if not bool(np.all(np.asarray(condition))):
         raise ValueError(message if isinstance(message, str) else message())
 
 
 def describe(value: Any, limit: int = 8) -> str:
-    """A short rendering of what the user gave."""
+    """A short description of a value passed by the user."""
     array = np.asarray(value)
     if array.size <= limit:
         return np.array2string(array, separator=", ").replace("\n", "")
@@ -81,7 +82,8 @@ _NUMPY = (np.ndarray, np.float32, np.float64)
 
 
 def require_digits(name: str, given: np.ndarray, times: np.ndarray) -> None:
-    """ValueError for ``times`` in whose dtype the steps of those ``given`` are off by a tenth."""
+    """ValueError if rounding ``given`` times to the dtype of ``times`` changes a step by more than
+    a tenth."""
     exact, steps = np.diff(given, axis=-1), np.diff(times, axis=-1)
     if np.any(np.abs(steps - exact) > 0.1 * np.abs(exact)):
         raise ValueError(
@@ -101,16 +103,16 @@ def as_float_array(
 ) -> Array:
     """A floating-point array whose trailing axes are ``suffix`` (None: any length).
 
-    Lists and integers become the default float type, floating arrays keep theirs.
-    Raises TypeError for what is no array of real numbers, ValueError for a wrong shape or,
-    where the values are known and ``finite``, for NaN or infinity. ``hint``: how to correct a
-    wrong shape.
+    Lists and integers get the default float dtype, floating arrays keep theirs. Raises TypeError
+    for values that are not arrays of real numbers, ValueError for a wrong shape or, for concrete
+    values and with ``finite``, for NaN or infinity. ``hint``: how to correct a wrong shape.
     """
     try:
         leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
         if any(leaf is None or isinstance(leaf, (str, bytes)) for leaf in leaves):
-            raise TypeError("no number")  # jax would read some strings as the name of a dtype
-        # ``jnp.asarray`` compiles a program, and an array is copied: its owner may change it
+            raise TypeError("no number")  # JAX would interpret some strings as dtypes
+        # ``jax.device_put`` of a NumPy array compiles no program, unlike ``jnp.asarray``. An array
+        # is copied, because the user may change it later.
         is_plain = isinstance(value, list | tuple) or type(value) is int
         if is_plain and all(type(x) in (float, int) for x in leaves):
             value = jax.device_put(np.array(value, float))
@@ -132,7 +134,7 @@ def as_float_array(
     fits = array.ndim >= n and all(want in (None, got) for want, got in zip(suffix, tail))
     if not fits:
         expected_shape = ", ".join(["...", *("n" if s is None else str(s) for s in suffix)])
-        if tuple(suffix) == (None,):  # of any length: only a number does not fit
+        if tuple(suffix) == (None,):  # any length is valid: the value is a single number
             hint = "give a row of numbers, such as [0.0, 10.0]"
         raise ValueError(f"{name} must have shape ({expected_shape}), got {array.shape}: {hint}.")
     if finite and is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
@@ -145,19 +147,20 @@ def as_float_array(
 
 @functools.cache
 def _weak_array(values: tuple[float, ...], wide: bool) -> Array:
-    del wide  # arrays of either default precision
+    del wide  # part of the cache key: arrays of either default precision
     with jax.ensure_compile_time_eval():
         return jnp.stack([jnp.asarray(x) for x in values])
 
 
 def default_array(values: tuple[float, ...]) -> Array:
-    """The default of an argument, weakly typed like a Python number: its dtype is that of the other
-    numbers of the scene."""
+    """The default of an argument, weakly typed like a Python number, so that it gets the dtype of
+    the other numbers of the scene."""
     return _weak_array(values, bool(jax.config.read("jax_enable_x64")))
 
 
 def as_vectors(name: str, value: Any, size: int = 3) -> Array:
-    """An array (..., size) of floats, also from lists; NaN passes, and arrays at no cost."""
+    """An array (..., size) of floats, also from lists; NaN is accepted. JAX arrays of floats are
+    returned without further checks, at no cost."""
     fits = isinstance(value, jax.Array) and value.shape[-1:] == (size,)
     if fits and jnp.issubdtype(value.dtype, jnp.floating):
         return value
@@ -165,7 +168,7 @@ def as_vectors(name: str, value: Any, size: int = 3) -> Array:
 
 
 def vectors_like(array: Any, value: Any, name: str = "vector") -> Array:
-    """Vectors (..., 3) of floats; lists and integers take the dtype of the array."""
+    """Vectors (..., 3) of floats; lists and integers get the dtype of ``array``."""
     vectors = as_vectors(name, value)
     has_dtype = jnp.issubdtype(getattr(value, "dtype", int), jnp.floating)
     return vectors if has_dtype else vectors.astype(array.dtype)
@@ -179,7 +182,7 @@ def as_number(name: str, value: Any) -> Array:
 def require_positive(
     name: str, array: Any, *, zero: bool = False, hint: str = "check its sign and its units"
 ) -> None:
-    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
+    """ValueError if a concrete array contains negative values (or zeros, unless ``zero``)."""
     if not is_concrete(array) or np.size(array) == 0:
         return
     minimum = float(np.min(np.asarray(array)))
@@ -200,7 +203,7 @@ def as_positive(name: str, value: Any, **options: Any) -> Array:
 def batch_of(**arguments: tuple[Array, int]) -> tuple[int, ...]:
     """The common batch axes of arrays ``name=(array, number of trailing axes)``.
 
-    Raises ValueError that names all shapes where they do not broadcast together.
+    Raises ValueError with all shapes if they do not broadcast together.
     """
     try:
         return np.broadcast_shapes(*(x.shape[: x.ndim - tail] for x, tail in arguments.values()))
@@ -214,14 +217,14 @@ def as_floats(
 ) -> tuple[Array, ...]:
     """Arrays ``name=(value, suffix)`` of one floating dtype and with common batch axes.
 
-    Python numbers and lists follow the dtype of the arrays among them; alone, they take the
-    default one. A mixture of array dtypes takes the wider one.
+    Python numbers and lists get the dtype of the arrays among the arguments, or the default one if
+    there are none. Arrays of several dtypes get the widest one.
     """
     arrays = [
         as_float_array(name, value, suffix, finite=finite)
         for name, (value, suffix) in arguments.items()
     ]
-    kinds = [  # of JAX's arrays: without jax_enable_x64 NumPy's float64 has become float32
+    kinds = [  # dtypes after conversion: without jax_enable_x64, NumPy's float64 becomes float32
         array.dtype
         for array, (value, _) in zip(arrays, arguments.values())
         if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)

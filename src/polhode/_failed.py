@@ -1,11 +1,12 @@
-"""Bodies that failed: samples and tangents of NaN, and no contribution to gradients.
+"""Bodies that failed: their samples and tangents are NaN, and they do not contribute to gradients.
 
-A failed body contributes zero, so that a loss that leaves it out has the gradient of the others. If
-no body of a call finished, the gradient is NaN: zeros would tell an optimiser that it has arrived.
+The gradient of a failed body is zero, so that a loss that leaves it out has the gradient of the
+other bodies. If no body of a call finished, the gradient is NaN, because an optimiser would take
+zero for convergence.
 
-A cotangent of zero is not enough for that: zero times a state that is NaN is NaN, and the sum over
-the bodies carries it to every parameter that they share. So programs of derivatives compute with
-numbers in place of NaN, and put NaN back into their results.
+Zero cotangents alone are not sufficient: zero times a state that is NaN is NaN, and the sum over
+the bodies adds it to every shared parameter. Therefore programs that compute derivatives replace
+NaN by numbers, and write NaN to their results at the end.
 """
 
 import jax.numpy as jnp
@@ -18,8 +19,8 @@ from polhode._scene import State
 def sound_state(
     state: State, is_needed: Array | bool = True, rate: float = 0.0
 ) -> tuple[State, Array]:
-    """The state with numbers in place of NaN and infinity if that ``is_needed``, and which bodies
-    (...) were finite. ``rate`` [rad/s]: about every axis, in place of such rates."""
+    """The state, in which numbers replace NaN and infinity if ``is_needed``; and which bodies (...)
+    were finite. ``rate`` [rad/s]: the replacement for body rates, about every axis."""
     is_attitude, is_rate = (
         jnp.isfinite(x).all(-1) | ~jnp.asarray(is_needed) for x in (state.wxyz, state.omega_body)
     )
@@ -32,9 +33,10 @@ def sound_state(
 
 
 def where_lost(x: Array, is_known: Array, value: float = jnp.nan) -> Array:
-    """``x`` where it is known, elsewhere ``value``, with tangents of NaN or zero as that is.
+    """``x`` where ``is_known``, elsewhere ``value``, with tangents of NaN if ``value`` is NaN, and
+    of zero otherwise.
 
-    ``is_known`` has the first axes of ``x``. Cotangents pass unchanged: see ``with_gradients``.
+    ``is_known`` has the first axes of ``x``. Cotangents are not changed: see ``with_gradients``.
     """
     is_known = jnp.expand_dims(is_known, tuple(range(is_known.ndim, x.ndim)))
 
@@ -51,8 +53,8 @@ def where_lost(x: Array, is_known: Array, value: float = jnp.nan) -> Array:
 
 
 def numbers(x: Array, value: float) -> Array:
-    """``x``, where it is differentiated with ``value`` in place of NaN and infinity and tangents of
-    zero there. Cotangents pass unchanged: see ``with_gradients``."""
+    """``x``; in programs that compute derivatives, ``value`` replaces NaN and infinity, with zero
+    tangents. Cotangents are not changed: see ``with_gradients``."""
 
     def again(operands):
         is_known = jnp.isfinite(operands[0])
@@ -71,10 +73,11 @@ def numbers(x: Array, value: float) -> Array:
 
 
 def with_gradients(x: Array, is_sound: Array, any_finished: Array) -> Array:
-    """``x``, NaN with its tangents for bodies that are not ``is_sound``. Its cotangents are zero
-    where it is NaN or infinite, and NaN everywhere if no body finished.
+    """``x``, which is NaN with NaN tangents for bodies that are not ``is_sound``. Its cotangents
+    are zero where it is NaN or infinite, and NaN everywhere if no body finished.
 
-    Each array of a trajectory by itself: only the cotangents that a gradient needs are computed.
+    It is applied to each array of a trajectory separately, so that only those cotangents are
+    computed that a gradient needs.
     """
     mask = jnp.expand_dims(is_sound, tuple(range(is_sound.ndim, x.ndim)))
 

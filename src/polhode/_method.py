@@ -16,7 +16,7 @@ from polhode._checks import as_float_array, describe, is_concrete, require, requ
 from polhode._parts import as_static, check_fields, takes
 from polhode._scene import Scene, State, check_scene
 
-# How the simulation of each body ended.
+# Outcomes of a simulation.
 
 
 class Status(enum.IntEnum):
@@ -35,7 +35,7 @@ class Status(enum.IntEnum):
 
     @property
     def explanation(self) -> str:
-        """What happened and how to correct it."""
+        """The cause and the remedy."""
         return _EXPLANATIONS[self]
 
 
@@ -86,14 +86,14 @@ _EXPLANATIONS = {
 
 
 class StepCounts(NamedTuple):
-    """What kept the steps of each body short; see ``Trajectory.step_counts``.
+    """Numbers of steps of each body by what limited them; see ``Trajectory.step_counts``.
 
     **Fields**, each (...) of integers: ``accepted``; ``refused``: attempts whose error was too
-    large, repeated with a shorter step; ``at_switches``: steps that ended where a switch of a
-    torque turned or an event occurred; ``at_times``: steps shortened to end at a saved time;
-    ``at_stability``: explicit Runge-Kutta steps as long as their stability allows, because
-    something decays fast (``ph.explain`` names an implicit method). All others were limited by the
-    error of the step. Methods that step by diffrax count the first two only.
+    large, repeated with a shorter step; ``at_switches``: steps that ended at a switch of a torque
+    or at an event; ``at_times``: steps shortened to end at a saved time; ``at_stability``: explicit
+    Runge-Kutta steps limited by stability, because of a fast decay (``ph.explain`` names an
+    implicit method). All others were limited by the error of the step. Methods that use a solver
+    of diffrax count the first two only.
     """
 
     accepted: Array
@@ -111,7 +111,7 @@ class StepCounts(NamedTuple):
         at_times: Array | None = None,
         at_stability: Array | None = None,
     ) -> "StepCounts":
-        """These counts; what is not counted is zero."""
+        """These counts; those that are None are zero."""
         accepted = jnp.asarray(accepted)
         others = (refused, at_switches, at_times, at_stability)
         return cls(accepted, *(jnp.zeros_like(accepted) if x is None else x for x in others))
@@ -125,7 +125,7 @@ class SimulationError(RuntimeError):
         self.status = status
 
 
-# What methods have in common.
+# The interface of all methods.
 
 
 class Record(eqx.Module):
@@ -135,18 +135,18 @@ class Record(eqx.Module):
     (..., T, 3) at all times, or at the last one.
 
     ``work``: also integrate the work [J] of the external torques. ``error``: also estimate the
-    error of each body at the last time, by a second, coarser run of about the same cost, and mark
-    bodies whose estimate is above ten times the tolerance by ``Status.INACCURATE``: chaotic
+    error of each body at the last time, by a second, coarser run of about the same cost. Bodies
+    with an estimate of more than ten times the tolerance get ``Status.INACCURATE``: chaotic
     bodies, and those whose rounding error exceeds the tolerance.
 
-    ``save``: a function of the motion that is stored in place of attitude and rates, as
+    ``save``: a function of the motion that is stored instead of attitude and rates, as
     ``Trajectory.saved``. It is called with the ``Trajectory`` of one body, without batch axes, and
-    returns an array (T, ...) or a pytree of such: one row for each sample. Batches are mapped over
-    it, a chunk of bodies at a time, so that the states of all bodies are never in memory together
-    (under ``vmap`` and in reverse mode they are). Rows are NaN from the failure of a body on. Of
-    the states themselves only the last is stored: see ``Trajectory.last``. An ``eqx.Module`` that
-    is called is differentiable in its arrays. Define the function once: another one is another
-    program to compile.
+    returns an array (T, ...) or a pytree of such arrays: one row for each sample. It is mapped over
+    batches, one chunk of bodies at a time, so that the states of all bodies are not in memory at
+    the same time (under ``vmap`` and in reverse mode they are). After the failure of a body its
+    rows are NaN. Of the states only the last is stored: see ``Trajectory.last``. If the function is
+    an ``eqx.Module``, results are differentiable with respect to its arrays. Define the function
+    once: each new function object is compiled again.
 
     Raises ValueError if nothing is recorded, TypeError for a ``save`` that does not take one
     argument; ``ph.simulate`` raises TypeError or ValueError for values that are not such arrays.
@@ -177,7 +177,7 @@ class Record(eqx.Module):
             save = as_static(save)
         self.save = save
         if not (self.attitude or self.rates):
-            raise ValueError("Record keeps nothing: switch on attitude, rates or both.")
+            raise ValueError("this Record would save nothing: set attitude, rates or both to True.")
 
     @property
     def of_states(self) -> "Record":
@@ -186,12 +186,13 @@ class Record(eqx.Module):
 
 
 class Samples(NamedTuple):
-    """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,), (N, T), (N,).
+    """Results of a method for N lanes: ``wxyz`` (N, T, 4), ``omega_body`` (N, T, 3), ``status``
+    (N,), ``steps`` (N,), ``work`` (N, T), ``error`` (N,).
 
-    ``error``: sum of the estimated errors of the steps, if the method knows it. ``motor_work``,
-    ``spins`` (N, T, m): of every wheel, and momenta of the coupled ones, or None. ``saved``,
-    ``final``: of ``Record(save=)``, its values and attitude, rates and momenta of coupled wheels
-    at the last time; methods leave them out.
+    ``error``: sum of the estimated errors of the steps, if the method estimates it.
+    ``motor_work`` (N, T, m): of every wheel; ``spins``: momenta of the coupled wheels; or None.
+    ``saved``, ``final``: for ``Record(save=)``, its values, and attitude, rates and momenta of
+    coupled wheels at the last time; they are not set by methods.
     """
 
     wxyz: Array | None
@@ -207,7 +208,8 @@ class Samples(NamedTuple):
 
 
 class AbstractMethod(eqx.Module):
-    """Base of all methods. ``run`` simulates N bodies; ``simulate`` checks inputs and batches.
+    """Base of all methods. ``run`` computes the motion of N lanes; ``ph.simulate`` checks the input
+    and handles batches.
 
     ``exact``: whether the method is a closed form, which does not compute the work.
     """
@@ -216,12 +218,12 @@ class AbstractMethod(eqx.Module):
 
     @property
     def is_compensated(self) -> bool:
-        """Whether rounding errors are carried along, so that they do not grow with the angle."""
+        """Whether rounding errors are compensated, so that they do not grow with the angle."""
         return False
 
     @property
     def keeps_rtol(self) -> bool:
-        """Whether ``rtol`` decides how accurate the motion is."""
+        """Whether ``rtol`` controls the accuracy of the motion."""
         return False
 
     @property
@@ -231,7 +233,7 @@ class AbstractMethod(eqx.Module):
 
     @abc.abstractmethod
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
-        """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
+        """Samples at ``ts`` (T,) or (N, T) of lanes whose ``state`` is that at the first time."""
 
     def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
         """Description of the steps for N lanes, for ``ph.explain``; empty for a closed form."""
@@ -240,7 +242,7 @@ class AbstractMethod(eqx.Module):
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Any, final_only: bool
     ) -> Any:
-        """Events during the motion, if the method can find them by itself; None otherwise."""
+        """Samples and events, if the method searches for events during the motion; else None."""
         return None
 
 
@@ -256,11 +258,11 @@ def check_options(
     max_steps: Any = None,
     chunk: Any = None,
 ) -> None:
-    """Options of a stepped method: diffrax's objects, not their classes, and numbers that count.
+    """Check the options of an integration: instances of diffrax's classes, and positive integers.
 
-    Raises TypeError for another kind, ValueError for an option that cannot work here.
+    Raises TypeError for another type, ValueError for an option that is not possible here.
     """
-    import diffrax  # here, so that closed forms do not wait for it
+    import diffrax  # here, so that closed forms do not load it
 
     for name, value, kind, example in (
         ("solver", solver, diffrax.AbstractSolver, "diffrax.Dopri8()"),
@@ -285,8 +287,8 @@ def check_options(
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
-            "adjoint=diffrax.BacksolveAdjoint() finds the way back by integrating it, which misses"
-            " rtol, and cannot reach the scene's numbers: use ph.FlowAdjoint() (the"
+            "adjoint=diffrax.BacksolveAdjoint() integrates the motion backward, which misses rtol,"
+            " and gives no derivatives with respect to the scene: use ph.FlowAdjoint() (the"
             " default), diffrax.RecursiveCheckpointAdjoint(), or diffrax.ForwardMode() for jax.jvp."
         )
     if isinstance(getattr(solver, "term_structure", None), tuple):
@@ -310,7 +312,7 @@ def check_options(
 
 
 def constructor_call(x: Any) -> str:
-    """How an object of this class, or of the class of this object, is written."""
+    """The constructor call of this class, or of the class of this object, for messages."""
     kind = x if isinstance(x, type) else type(x)
     room = kind.__module__.split(".")[0]
     return f"{'ph' if room == 'polhode' else room}.{kind.__name__}()"
@@ -320,10 +322,10 @@ def constructor_call(x: Any) -> str:
 
 
 def check_method(method: Any) -> None:
-    """Methods are objects, never strings."""
+    """TypeError unless ``method`` is None or an instance of a method class."""
     if method is None or isinstance(method, AbstractMethod):
         return
-    import diffrax  # here, so that closed forms do not wait for it
+    import diffrax  # here, so that closed forms do not load it
 
     kind = method if isinstance(method, type) else type(method)
     if isinstance(method, type) and issubclass(method, AbstractMethod):
@@ -334,7 +336,7 @@ def check_method(method: Any) -> None:
     elif issubclass(kind, diffrax.AbstractSolver):
         description, remedy = (
             f"the solver {kind.__name__}",
-            f": hand it to a chart, ph.LiePoisson({constructor_call(method)})",
+            f": pass it to a coordinate system, ph.LiePoisson({constructor_call(method)})",
         )
     else:
         description, remedy = type(method).__name__, ""
@@ -349,15 +351,15 @@ def check_method(method: Any) -> None:
 
 
 def check_kinds(scene: Any, state: Any) -> None:
-    """A scene and a state."""
+    """TypeError unless ``scene`` is a ``Scene`` and ``state`` a ``State``."""
     for name, value, kind in (("scene", scene, Scene), ("state", state, State)):
         if not isinstance(value, kind):
             raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
 
 
 def of_one_dtype(name: str, tree: Any) -> tuple[Any, Any]:
-    """The tree with numbers of Python in the dtype of its arrays, and that dtype. Raises TypeError
-    for several dtypes, or one that is too coarse."""
+    """The tree with weakly typed numbers in the dtype of its arrays, and that dtype. Raises
+    TypeError for several dtypes, or one of too low precision."""
     dtypes = _dtypes(jax.tree.leaves(tree))
     if len(dtypes) > 1:
         tree = _in_one_dtype(tree)
@@ -370,7 +372,7 @@ def of_one_dtype(name: str, tree: Any) -> tuple[Any, Any]:
     dtype = dtypes.pop()
     if dtype not in (jnp.float32, jnp.float64):
         raise TypeError(
-            f"{name} are of {dtype}, which is too coarse to move a body by: make all"
+            f"{name} are of {dtype}, whose precision is too low: make all"
             " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
         )
     return tree, dtype
@@ -379,7 +381,7 @@ def of_one_dtype(name: str, tree: Any) -> tuple[Any, Any]:
 def check_inputs(
     scene: Any, state: Any, ts: Any, record: Any
 ) -> tuple[Scene, State, Array, Record]:
-    """Kinds, dtypes and times, with messages that say how to fix them."""
+    """The checked input of ``ph.simulate``: types, dtypes and times."""
     check_kinds(scene, state)
     record = _DEFAULT if record is None else record
     if not isinstance(record, Record):
@@ -393,13 +395,13 @@ def check_inputs(
 
 
 def _dtypes(leaves: list[Any]) -> set[Any]:
-    """Those of the arrays that hold inexact numbers."""
+    """The dtypes of the arrays of inexact numbers."""
     dtypes = {x.dtype for x in leaves if isinstance(x, _ARRAYS)}
     return {x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
 
 
 def _in_one_dtype(tree: Any) -> Any:
-    """Arrays from Python numbers and defaults (weakly typed) in the dtype of the other arrays."""
+    """The tree with weakly typed arrays (Python numbers, defaults) in the dtype of the others."""
     leaves = jax.tree.leaves(tree)
     strong = _dtypes([x for x in leaves if not (isinstance(x, jax.Array) and x.weak_type)])
     if len(strong) != 1:
@@ -418,7 +420,7 @@ _ARRAYS = (jax.Array, np.ndarray)
 
 
 def _times(ts: Any, dtype: Any) -> Any:
-    """Times (..., T) of the dtype; known ones in NumPy, which costs no dispatch."""
+    """Times (..., T) of the dtype; concrete ones as NumPy arrays, which need no dispatch."""
     kinds = (float, int, np.float64, np.int64)
     if isinstance(ts, list | tuple) and all(type(x) in kinds for x in ts):
         ts = np.asarray(ts, float)
@@ -432,8 +434,8 @@ def _times(ts: Any, dtype: Any) -> Any:
 
 
 def check_times(ts: Array | np.ndarray) -> None:
-    """At least two times, strictly monotonic where they are known."""
-    if ts.shape[-1] < 2:  # the message costs more than a small simulation
+    """ValueError for fewer than two times, or concrete ones that are not strictly monotonic."""
+    if ts.shape[-1] < 2:  # no ``require``: to format the message takes longer than a simulation
         given = describe(ts) if is_concrete(ts) else f"an array of shape {ts.shape}"
         raise ValueError(f"ts must hold at least two times, got {given}: the state holds at ts[0].")
     if not is_concrete(ts):
@@ -453,17 +455,17 @@ def check_times(ts: Array | np.ndarray) -> None:
 
 
 def default_rtol(dtype: Any) -> float:
-    """What ``rtol=None`` means: 1e-9 in float64, 1e-5 in float32."""
+    """The default of ``rtol``: 1e-9 in float64, 1e-5 in float32."""
     return 1e-9 if float(jnp.finfo(dtype).eps) < 1e-9 else 1e-5
 
 
 def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
-    """The tolerance in the state's dtype; a number that is known stays known under ``jit``."""
-    eps = float(jnp.finfo(dtype).eps)
+    """The tolerance in the dtype of the state; a concrete number remains concrete under ``jit``."""
     if rtol is None:
-        rtol = default_rtol(dtype)
+        return np.asarray(default_rtol(dtype), dtype)
     if isinstance(rtol, Tracer) and rtol.ndim == 0:
         return jnp.asarray(rtol, dtype)
+    eps = float(jnp.finfo(dtype).eps)
     number = _number("rtol", rtol)
     require(np.isfinite(number) and number > 0, f"rtol must be positive, got {rtol}.")
     require(
@@ -480,7 +482,7 @@ def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
 
 
 def _number(name: str, value: Any) -> float:
-    """One known real number; TypeError for strings, truth values, arrays and the rest."""
+    """A concrete real number; TypeError for strings, truth values, arrays and anything else."""
     try:
         if isinstance(value, str | bytes | bool) or np.ndim(value) != 0:
             raise TypeError("no number")
@@ -495,7 +497,7 @@ def raise_on_failure(
     status: Array,
     remedy: str = "Pass throw=False to get the trajectory with its status per body.",
 ) -> None:
-    """SimulationError naming what happened to how many bodies, and which came first."""
+    """SimulationError if bodies failed: for each status the number of bodies and the first one."""
     ended = np.asarray(status)
     if not ended.any():  # all Status.SUCCESSFUL
         return
@@ -513,10 +515,10 @@ def raise_on_failure(
 def status_with_input_errors(
     status: Array, scene: Scene, ts: Array, rtol: Array | float | None
 ) -> Array:
-    """The status (N,) of lanes, or what is wrong with the input of those that were given nonsense.
+    """The status (N,) of lanes, replaced by that of invalid input where the input is invalid.
 
-    What ``check_inputs`` refuses where numbers are known, found in the compiled program where they
-    are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T).
+    These are the checks of ``check_inputs``, here in the compiled program, for traced numbers: a
+    few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T).
     """
     if rtol is not None:
         min_rtol = 8 * float(jnp.finfo(ts.dtype).eps)

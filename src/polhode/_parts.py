@@ -1,8 +1,9 @@
-"""What scenes are made of: parts with batch axes, and the functions that users give them."""
+"""Parts of a scene: their batch axes, and checks of their fields and of users' functions."""
 
 import dataclasses
 import functools
 import inspect
+import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,11 +17,11 @@ from jaxtyping import Array
 
 from polhode._checks import is_concrete
 
-# Modules whose array fields state the shape of the numbers of one body.
+# Parts: modules whose array fields declare their shape for one body.
 
 
 def shaped(*core: int | None, **options: Any) -> Any:
-    """A field for an array of shape ``(..., *core)``, batch axes first; None: of any length."""
+    """A field for an array of shape ``(..., *core)``, batch axes first; None: any length."""
     return eqx.field(metadata={"core": core}, **options)
 
 
@@ -30,49 +31,55 @@ def _cores(kind: type) -> dict[str, tuple[int | None, ...]]:
     return {field.name: field.metadata["core"] for field in fields if "core" in field.metadata}
 
 
+_UNSHOWN = re.compile(r"(?<=\()\s*\w+=None,|,\s*\w+=None(?=[,\s)])|, weak_type=True")
+
+
 class Printable(eqx.Module):
-    """Base of what ``print`` shows with its numbers where they are known and few, else shapes."""
+    """Base of modules that print their numbers if these are concrete and few, otherwise shapes.
+
+    Fields that are None, and JAX's weak types, are not printed.
+    """
 
     def __str__(self) -> str:
         leaves = jax.tree.leaves(self)
         few = is_concrete(leaves) and sum(map(np.size, leaves)) <= 100
-        return eqx.tree_pformat(self, short_arrays=not few)
+        return _UNSHOWN.sub("", eqx.tree_pformat(self, short_arrays=not few))
 
 
 class AbstractPart(Printable):
-    """Base of all that may carry batch axes: the state, and what a scene is made of.
+    """Base of all modules that may have batch axes: the state and the parts of a scene.
 
-    Array fields that bodies may differ in are declared by ``shaped``; what stands in any other
-    field is shared by all bodies.
+    Array fields that may differ between bodies are declared by ``shaped``; all other fields are
+    common to all bodies.
 
-    ``smooth``: whether what the part contributes is a smooth function of state and time between
-    the edges that it declares. Steps are searched for jumps of parts that are not.
+    ``smooth``: whether the contribution of the part is a smooth function of state and time between
+    the edges that it declares. If not, steps are searched for jumps.
     """
 
     smooth: ClassVar[bool] = True
 
     @property
     def core_ranks(self) -> dict[str, int]:
-        """The array fields by name, each with its rank without batch axes."""
+        """Rank without batch axes of each array field."""
         return {name: len(core) for name, core in _cores(type(self)).items()}
 
     @property
     def input_conditions(self) -> tuple[Array, ...]:
-        """What must hold (...) of limits and edges, in compiled programs too.
+        """Conditions (...) on limits and edges, checked in compiled programs as well.
 
-        A comparison takes NaN, or a limit of the wrong sign, for a number like others: the motion
-        stays finite, and its derivative is zero. The status of such a body is ``NOT_FINITE``.
+        Comparisons with NaN, or with a limit of the wrong sign, do not make the motion NaN, but the
+        motion is wrong and its derivative zero. The status of such a body is ``NOT_FINITE``.
         """
         return ()
 
 
 def above_zero(*limits: Array | None) -> tuple[Array, ...]:
-    """That limits are positive, and hence not NaN; nothing for those that are None."""
+    """Conditions that limits are positive, and hence not NaN; none for limits that are None."""
     return tuple(limit > 0 for limit in limits if limit is not None)
 
 
 def all_input_conditions(part: Any) -> tuple[Array, ...]:
-    """``input_conditions`` of a part and of what it is made of."""
+    """``input_conditions`` of a part and of the parts inside it."""
     if not isinstance(part, AbstractPart):
         return ()
     names = () if isinstance(part, AbstractSum) else part.core_ranks
@@ -81,28 +88,28 @@ def all_input_conditions(part: Any) -> tuple[Array, ...]:
 
 
 class AbstractSum(AbstractPart):
-    """Base of the sums of parts of one kind: ``terms`` carry the batch axes, each its own."""
+    """Base of the sums of parts of one kind; each of the ``terms`` has its own batch axes."""
 
     terms: tuple[Any, ...]
 
 
 def summands(part: AbstractPart | None) -> tuple[Any, ...]:
-    """The terms of a sum, a part that is no sum alone, nothing for None."""
+    """The terms of a sum; the part itself if it is not a sum; () for None."""
     if part is None:
         return ()
     return part.terms if isinstance(part, AbstractSum) else (part,)
 
 
 def check_fields(part: AbstractPart, name: str) -> None:
-    """TypeError unless the array fields of a part, and of what it is made of, hold arrays.
+    """TypeError unless the array fields of a part, and of the parts inside it, contain arrays;
+    ValueError for an array of a wrong shape.
 
-    ``eqx.tree_at`` may put a number or a list there, or an array of another shape (ValueError).
-    Nothing is checked while a part is unflattened: ``jax.tree.map``, ``in_axes`` and the masks of
-    optax put other things than arrays into these places. ``name``: what the part is called in the
-    message.
+    ``eqx.tree_at`` may have put a number, a list or another array there. The constructors cannot
+    check this, because ``jax.tree.map``, ``in_axes`` and the masks of optax build parts with other
+    objects in these fields. ``name``: the name of the part in messages.
     """
-    # A function, and not a method: Equinox builds an object for every method that is looked up,
-    # which takes longer than the check.
+    # A function instead of a method: Equinox builds an object whenever a method is accessed, which
+    # takes longer than the check.
     for i, term in enumerate(part.terms if isinstance(part, AbstractSum) else ()):
         check_fields(term, f"{name}.terms[{i}]")
     if type(part).core_ranks is not AbstractPart.core_ranks:  # a class of the user
@@ -124,7 +131,7 @@ def check_fields(part: AbstractPart, name: str) -> None:
 
 
 def _refuse(value: Any, name: str, core: tuple[int | None, ...]) -> None:
-    """The error for what is no array of floats (..., *core)."""
+    """Raise the error for a value that is not an array of floats (..., *core)."""
     shape = ", ".join(["...", *("n" if size is None else str(size) for size in core)])
     if isinstance(value, _ARRAYS) and jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"{name} must have shape ({shape}), got {value.shape}.")
@@ -159,10 +166,10 @@ _ARRAYS = (jax.Array, np.ndarray, np.generic)
 _FLOATS = tuple(np.dtype(x) for x in (np.float64, np.float32, np.float16, jnp.bfloat16))
 
 
-# Functions of users: their arguments and results are checked once. A plain function is no array: as
-# a leaf it would stop ``jax.jit`` and ``jax.tree.map`` over a scene, and is therefore static data,
-# equal to itself only. What is a pytree already (an ``eqx.Module``, ``jax.tree_util.Partial``)
-# stays as it is: its arrays are leaves of the scene.
+# Functions of users: their arguments and results are checked once. As a leaf, a plain function
+# would make ``jax.jit`` and ``jax.tree.map`` over a scene fail; it is therefore static data, equal
+# to itself only. A function that is a pytree (an ``eqx.Module``, ``jax.tree_util.Partial``) is not
+# wrapped: its arrays are leaves of the scene.
 
 
 _NAMES = {
@@ -173,11 +180,11 @@ _NAMES = {
     "position": {"position", "x", "position_space"},
     "velocity": {"velocity", "v", "velocity_space"},
 }
-"""What users call an argument that we call by the first of these."""
+"""Common names of each argument, by which a wrong order of arguments is recognised."""
 
 
 class Function(eqx.Module):
-    """A function of the user as static data: no leaf of the tree, equal to itself only."""
+    """A user's function as static data of a pytree, equal to itself only."""
 
     fn: Callable = eqx.field(static=True)
 
@@ -197,7 +204,8 @@ def as_static(fn: Callable) -> Callable:
 
 
 def takes(name: str, fn: Any, arguments: Sequence[str]) -> None:
-    """TypeError unless ``fn`` takes these arguments, in this order as far as its names tell."""
+    """TypeError unless ``fn`` takes these arguments, in this order as far as the names of its
+    parameters show."""
     call = f"fn({', '.join(arguments)})"
     if not callable(fn):
         raise TypeError(f"{name} takes a function {call}, got {type(fn).__name__}: {fn!r:.80}.")
@@ -236,7 +244,7 @@ _TRACED = (
 
 
 def _remedy_for(error: Exception) -> str:
-    """The jax.numpy form of what raised one of ``_TRACED``."""
+    """Cause and remedy, in jax.numpy, of an error among ``_TRACED``."""
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return "NumPy cannot compute with it. Use jax.numpy, such as jnp.sin(x) for np.sin(x)"
     if isinstance(error, jax.errors.TracerBoolConversionError):
@@ -253,7 +261,7 @@ def _remedy_for(error: Exception) -> str:
 
 
 def _place_of(error: Exception) -> str:
-    """File, line and text of the user's own line that raised; empty where it is not known."""
+    """File, line and text of the user's line that raised the error; empty if not found."""
     libraries = tuple(str(Path(m.__file__).parent) for m in (jax, np, eqx) if m.__file__)
     package = str(Path(__file__).parent)
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
@@ -263,10 +271,10 @@ def _place_of(error: Exception) -> str:
 
 
 def call_traced(call: str, detail: str, fn: Callable, *args: Any) -> Any:
-    """What ``fn(*args)`` returns; ``call``, ``detail``: how messages describe the call.
+    """``fn(*args)``; ``call``, ``detail``: the description of the call in messages.
 
-    TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and its jax.numpy
-    form; what the function raises otherwise passes, with a note on how it was called.
+    TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and the remedy; other
+    errors of the function get a note that describes the call.
     """
     try:
         return fn(*args)
@@ -292,11 +300,10 @@ def result_of(
     *args,
     hint: str = "It sees one body at one time: batches are mapped over it.",
 ) -> Array:
-    """What ``fn(*args)`` returns as an array of ``shape`` and ``dtype`` (None: its own).
+    """``fn(*args)`` as an array of ``shape`` and ``dtype`` (None: its own).
 
-    TypeError or ValueError for anything else, naming what was returned and what is expected;
-    TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and its jax.numpy
-    form; what the function raises otherwise passes, with a note on how it was called.
+    TypeError or ValueError for any other result, with the result and the requirement; further
+    errors as in ``call_traced``.
     """
     call = f"{name}, called as fn({', '.join(arguments)})"
     shapes = ", ".join(f"{k}: {jnp.shape(x)}" for k, x in zip(arguments, args))
@@ -331,17 +338,15 @@ def result_of(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Signature:
-    """What the functions given to ``name`` take and return: shapes of one body at one time."""
+    """Arguments and result of the functions passed to ``name``: shapes for one body at one time."""
 
     name: str
     arguments: Mapping[str, tuple[int, ...]]
     returns: tuple[int, ...] = ()
 
     def checked(self, fn: Any) -> Callable:
-        """The function (see ``as_static``) after a check of its arguments and its result.
-
-        Nothing is computed: the function is traced once with arguments of these shapes.
-        """
+        """The function (see ``as_static``) after a check of its arguments and its result, by
+        tracing it once with arguments of these shapes."""
         takes(self.name, fn, tuple(self.arguments))
         fn = as_static(fn)
         dtype = jnp.result_type(float)
@@ -352,7 +357,7 @@ class Signature:
         return fn
 
     def mapped(self, fn: Callable, *args: Any) -> Array:
-        """``fn`` over the leading axes of its arguments: (..., *returns) of their dtype."""
+        """``fn`` mapped over the leading axes of its arguments: (..., *returns) of their dtype."""
         arrays = [x for x in args if hasattr(x, "dtype")]
         dtype = jnp.result_type(*arrays) if arrays else None
         inputs, outputs = (

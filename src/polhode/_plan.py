@@ -27,11 +27,12 @@ class Plan:
     """The chosen method, what is skipped, and the reasons; ``print`` shows them.
 
     **Fields:** ``method``; ``reason``: why this one; ``skipped``: what is absent from the compiled
-    program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the work;
-    ``error``: the attitude error to be expected, in words; ``refused``: the closed forms that do
+    program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the problem;
+    ``error``: the expected error of the attitude, in words; ``refused``: the closed forms that do
     not apply, with the reason, if the motion is integrated; ``narrower``: the constructors that
     allow a closed form for these numbers (``ph.specialise`` uses them); ``plain``: why the
-    optimisations for CPUs are off, or None; ``stiff``: a decay that limits explicit steps, or None.
+    optimisations for CPUs are off, or None; ``stiff``: a description of a decay that limits
+    explicit steps, or None.
     """
 
     method: AbstractMethod
@@ -48,7 +49,7 @@ class Plan:
 
     @property
     def closed_form(self) -> str | None:
-        """The name of the closed-form solution; None where the motion is integrated."""
+        """The name of the closed-form solution; None if the motion is integrated."""
         return self.method.name if self.method.exact else None
 
     def __str__(self) -> str:
@@ -73,9 +74,10 @@ def _listed(word: str, reasons: tuple[str, ...]) -> list[str]:
 
 
 class Solution(NamedTuple):
-    """One row: name, what ``explain`` prints where it runs, and the method that evaluates it.
+    """A closed-form solution: its name, the explanation that ``ph.explain`` prints, and the method
+    that evaluates it.
 
-    ``symmetry``: that of the type of the inertia; None: decided by the method.
+    ``symmetry``: required symmetry of the type of the inertia; None: the method decides.
     """
 
     name: str
@@ -84,7 +86,7 @@ class Solution(NamedTuple):
     symmetry: Symmetry | None = None
 
     def why_not(self, scene: Scene) -> str | None:
-        """Why the types of the parts do not make it valid; None: they do."""
+        """Why it is not valid for the types of the parts; None if it is valid."""
         if isinstance(scene.inertia, VariableInertia):
             return VARIABLE
         reason = self.method.why_not(scene)
@@ -132,7 +134,8 @@ CLOSED_FORMS = (
 
 
 def choose_closed_form(scene: Scene) -> tuple[Solution | None, tuple[str, ...]]:
-    """The first closed form that the types make valid, or None; and why those before it are not."""
+    """The first closed form that is valid for the types of the parts, or None; and why those before
+    it are not."""
     refusals = []
     for solution in CLOSED_FORMS:
         reason = solution.why_not(scene)
@@ -145,15 +148,16 @@ def choose_closed_form(scene: Scene) -> tuple[Solution | None, tuple[str, ...]]:
 def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, str]:
     """The method that ``simulate(..., method=None)`` uses, and why.
 
-    The types of the parts decide, and ``rtol`` where it is a number; no number of the scene, of the
-    state or of the times does. So plain calls, ``jit``, ``vmap`` and ``grad`` choose alike.
+    The choice depends on the types of the parts, and on ``rtol`` if it is concrete, but on no
+    number of the scene, the state or the times. Therefore it is the same under ``jit``, ``vmap``
+    and ``grad``.
     """
     solution = _closed_form_of(jax.tree.structure(scene))
     eps = float(jnp.finfo(scene.inertia.dtype).eps)
     if solution is None:
         reason = (
-            "something acts on the body: integrated in steps with an error estimate, held to"
-            " rtol at every saved time"
+            "no closed form applies: integrated, with an estimated error below rtol at every saved"
+            " time"
         )
         compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
         return _integration_method(_has_axis(scene), compensated, _low_order(scene, rtol)), reason
@@ -166,7 +170,7 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
 
 @functools.lru_cache(maxsize=256)
 def _closed_form_of(tree: Any) -> Solution | None:
-    """The closed form of scenes of this structure, which has no numbers."""
+    """The closed form of scenes of this tree structure, which does not contain their numbers."""
     return choose_closed_form(jax.tree.unflatten(tree, [0.0] * tree.num_leaves))[0]
 
 
@@ -175,7 +179,7 @@ _COMPENSATED = ClosedForm(compensated=True)
 
 @functools.cache
 def _integration_method(upright: bool, compensated: bool, low_order: bool) -> AbstractMethod:
-    # here, so that diffrax loads with the first scene that is integrated
+    # imported here, so that diffrax is loaded with the first scene that is integrated
     from polhode._integrate import Automatic, LiePoisson, LiePoissonChart
 
     return LiePoisson(
@@ -199,7 +203,7 @@ def _is_below(rtol: Array | float, limit: float, scene: Scene) -> bool:
 
 
 def _has_axis(scene: Scene) -> bool:
-    """Whether the potential has one direction in space and nothing else does."""
+    """Whether the potential depends on a single direction in space, and there is no torque."""
     potential = scene.potential
     if scene.torque is not None:
         return False
@@ -209,14 +213,14 @@ def _has_axis(scene: Scene) -> bool:
 
 
 def _max_angle(state: State, ts) -> float:
-    """Angle [rad] of the body that turns farthest."""
+    """The largest angle of rotation [rad] of a body, from its initial rate."""
     ts = np.asarray(ts)
     span = np.abs(ts[..., -1] - ts[..., 0])
     if not state.omega_body.size or not span.size:
         return 0.0
     if state.omega_body.size < 10_000:
         return float(np.max(np.linalg.norm(np.asarray(state.omega_body), axis=-1) * span))
-    with jax.ensure_compile_time_eval():  # many: where they lie, also under a user's jit
+    with jax.ensure_compile_time_eval():  # many bodies: on their devices, also under ``jit``
         size = jnp.linalg.norm(state.omega_body, axis=-1)
         return float(jnp.max(size * jnp.asarray(span, size.dtype)))
 
@@ -228,9 +232,10 @@ def plan(
     method: AbstractMethod | None,
     rtol: Array,
     record: Record,
-    reason: str = "as asked for",
+    reason: str = "as requested",
 ) -> Plan:
-    """The plan of checked input (see ``ph.explain``); ``reason``: why a given method runs."""
+    """The plan for checked input (see ``ph.explain``); ``reason``: why ``method`` is used, if it is
+    not None."""
     refusals, narrower, stiff = (), (), None
     if method is None:
         method, reason = choose(scene, rtol)
@@ -259,17 +264,17 @@ def plan(
 
 
 _STIFF = 1e4
-"""[spans] Number of relaxation times in the time simulated from which ``explain`` warns. Explicit
-steps of order 8 are stable up to about six relaxation times each."""
+"""[relaxation times] In the time simulated, from which on ``explain`` warns. Explicit steps of
+order 8 are stable up to about six relaxation times each."""
 
 
 def _stiff(scene: Scene, state: State, ts: Array) -> str | None:
-    """A warning where explicit steps are limited by stability; None where they are not."""
+    """A warning if stability limits explicit steps; None otherwise."""
     if (scene.torque is None and scene.rotors is None) or not is_concrete(scene, state, ts):
         return None
     try:
         rate = float(np.max(_decay(scene, state, ts), initial=0))
-    except ValueError:  # a part has no derivative, as one that calls Python back
+    except ValueError:  # a part has no derivative, such as a callback to Python
         return None
     number = rate * float(np.max(np.abs(ts[..., -1] - ts[..., 0])))
     if not number >= _STIFF:
@@ -281,11 +286,12 @@ def _stiff(scene: Scene, state: State, ts: Array) -> str | None:
 
 
 def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
-    """Rate [1/s] (...) of the fastest decay of body rates and wheel speeds, linearised at the start
-    and, as friction changes most there, where the wheels are at rest in the body."""
+    """Rate [1/s] (...) of the fastest decay of body rates and wheel speeds. The equations are
+    linearised at the start and where the wheels are at rest in the body, since friction changes
+    most there."""
     rates = []
     for jacobian in _jacobians(scene, state, ts):
-        if isinstance(jacobian, Tracer):  # a function of the scene closes over one
+        if isinstance(jacobian, Tracer):  # a function in the scene closes over a traced value
             return np.zeros(jacobian.shape[:-2])
         jacobian = np.asarray(jacobian, float)
         sound = np.where(np.isfinite(jacobian), jacobian, 0)
@@ -295,8 +301,8 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
 
 @jit_distinct  # one program: its operations one by one take ten times as long
 def _jacobians(scene: Scene, state: State, ts: Array) -> list[Array]:
-    """Derivatives (..., n, n) [1/s] of the rates of change of body rates and wheel momenta by these
-    themselves, at the points of ``_decay``."""
+    """Jacobians (..., n, n) [1/s] of the rates of change of body rates and wheel momenta, at the
+    points of ``_decay``."""
     state = state.as_unit()
     scene, t = scene.settled(state, ts[..., 0]), ts[..., 0]
     parts = (getattr(scene, name) for name in PARTS)
@@ -336,7 +342,7 @@ def _jacobians(scene: Scene, state: State, ts: Array) -> list[Array]:
 
 
 def _narrower(scene: Scene) -> tuple[str, ...]:
-    """The constructors by which ``specialise`` allows a simpler closed form."""
+    """The constructors that would permit a simpler closed form for these numbers."""
     if not is_concrete(scene):
         return ()
     special = specialise(scene)
@@ -348,10 +354,10 @@ def _narrower(scene: Scene) -> tuple[str, ...]:
 
 
 def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str:
-    """The rule of the steps, found as ``simulate`` finds it."""
+    """The description of the steps, for the lanes that ``simulate`` would integrate."""
     words: list[str] = []
 
-    def look(scene, state, ts):
+    def describe_lanes(scene, state, ts):
         scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
         parts = {name: getattr(scene, name) for name in PARTS}
         batch = common_batch(*parts.values(), state, extra=(ts.shape[:-1],))
@@ -359,7 +365,7 @@ def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str
         times = lane_times(ts, batch)
         words.append(method.steps_of(lanes, flatten(state, batch, shared=False), times, record))
 
-    eqx.filter_eval_shape(look, scene, state, ts)
+    eqx.filter_eval_shape(describe_lanes, scene, state, ts)
     return words[0]
 
 
@@ -393,18 +399,18 @@ _MEANING = "as the steps estimate it (docs/methods.md: What rtol means)"
 
 
 def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: Array) -> str:
-    """The error of the attitude that is to be expected, in words."""
+    """The expected error of the attitude, in words."""
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
     if not method.exact:
         if not method.keeps_rtol:
-            return "as the steps asked for make it"
+            return "unknown: the requested steps do not follow from rtol"
         if not is_concrete(rtol):
             return f"about rtol rad at every saved time, {_MEANING}"
         if is_concrete(state.omega_body, ts) and 4 * eps * _max_angle(state, ts) > float(rtol):
             angle = _max_angle(state, ts)
             return (
-                f"about {4 * eps * angle:.0e} rad at the last time: rounding of {angle:.2g} rad"
-                f" turned takes more than the {rtol:.0e} asked for"
+                f"about {4 * eps * angle:.0e} rad at the last time: over a rotation of {angle:.2g}"
+                f" rad, rounding exceeds the requested {rtol:.0e}"
             )
         return f"about {rtol:.0e} rad at every saved time, {_MEANING}"
     if method.is_compensated and scene.inertia.symmetry is Symmetry.NONE:

@@ -1,10 +1,9 @@
-"""One step of a filter: a state carried on, with the Jacobian of the exact flow."""
+"""The prediction step of a filter: the next state, with the Jacobian of the exact flow."""
 
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike, is_concrete, require
+from polhode._checks import ArrayLike, is_concrete, numbers, require
 from polhode._integrate._field import uses
+from polhode._kernels import jit_distinct
 from polhode._method import (
     AbstractMethod,
     Status,
@@ -29,20 +29,20 @@ from polhode._scene._scene import places_of
 from polhode._simulate import simulate
 
 _NODES = 8
-"""Gauss points of each part of a step that the effect of a disturbance is integrated over where the
-motion has a closed form; their error falls with the 16th power of the angle turned in a part: 1e-12
-of the effect for a third of a turn."""
+"""Gauss points of each part of a step, for the integral of the effect of a disturbance on a motion
+in closed form. The error falls with the 16th power of the angle of rotation in a part: for a third
+of a revolution it is 1e-12 of the effect."""
 
 _MOST_PARTS = 1024
-"""Parts of a step: what they take of memory grows with their number."""
+"""Maximum number of parts of a step; the memory is proportional to it."""
 
 _TURN = np.pi
-"""Angle [rad] by the largest body rate that a part of a step may take. With twice that the effect
-is in error by up to 2e-7 of itself."""
+"""Maximum angle [rad] of rotation in a part, by the largest body rate. With twice this angle the
+relative error of the effect is up to 2e-7."""
 
 
 _ROUNDED = 1e-2
-"""Part of a step by which rounding of the time may change its length."""
+"""Maximum relative change of the length of a step by rounding of the time."""
 
 
 class Propagation(NamedTuple):
@@ -89,21 +89,22 @@ def propagate(
     The Jacobian is that of the exact flow, by forward differentiation through ``ph.simulate``.
     ``noise`` is the derivative by a disturbance torque on the body [N m] that is constant over the
     step, in body axes: a torque of spectral density s [N^2 m^2 s] adds ``noise @ noise.T * s / dt``
-    to the covariance. In closed form it is integrated over the step. There it is NaN if the body
-    turns by more than half a turn in a step under ``jit`` or ``vmap``, or by more than 512 turns
-    elsewhere: propagate in shorter steps, or by ``method=ph.LiePoisson()``.
+    to the covariance. For a motion in closed form it is integrated over the step. It is then NaN if
+    the body rotates by more than half a revolution in a step under ``jit`` or ``vmap``, or by more
+    than 512 revolutions otherwise: use shorter steps, or ``method=ph.LiePoisson()``.
 
-    **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
-    ``t``: matters only to a scene that depends on time; there the rounded difference ``(t + dt) -
-    t`` must equal ``dt`` to 1 %; in single precision and for steps of 0.1 s this holds up to about
-    16,000 s. ``free``: None, or a function that picks leaves of the scene, ``lambda s:
+    **Arguments:** ``scene``, ``state``: of one body; for several use ``jax.vmap``. ``dt``: not
+    zero. ``t``: has an effect only if the scene depends on time; the rounded difference ``(t + dt)
+    - t`` must then equal ``dt`` to 1 %, which in single precision and for steps of 0.1 s is so up
+    to about 16,000 s. ``free``: None, or a function that selects leaves of the scene, ``lambda s:
     s.inertia.diagonal``: their entries are the parameters. ``method``, ``rtol``: as for
-    ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not finish or ``t +
-    dt`` is rounded too much.
+    ``ph.simulate``, whose errors are raised; under ``jit`` the result is NaN if the body did not
+    finish or ``t + dt`` is rounded too much.
 
-    Raises ValueError for a batch, a ``dt`` that times near ``t`` do not resolve, or a ``free`` that
-    picks the speed or momentum of a wheel that is a coordinate already; TypeError for what is no
-    scene or no state, or a ``free`` that picks what is no array of the scene.
+    Raises ValueError for a batch, a ``dt`` that times close to ``t`` do not resolve, or a ``free``
+    that selects the speed or momentum of a wheel that is a coordinate already; TypeError for a
+    scene or state of another type, or a ``free`` that selects other objects than arrays of the
+    scene.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
@@ -120,7 +121,7 @@ def propagate(
             f" {state.wxyz.shape}, {state.omega_body.shape}: map it, jax.vmap(ph.propagate, ...)."
         )
     dtype = state.omega_body.dtype
-    dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
+    dt, t = _number(dt, dtype), _number(t, dtype)
     if dt.ndim or t.ndim:
         raise ValueError(
             f"dt and t are one number each, got shapes {dt.shape}, {t.shape}: for several steps"
@@ -130,7 +131,8 @@ def propagate(
         not is_concrete(dt) or (np.isfinite(dt) and dt != 0),
         f"dt must be a number other than zero, got {dt}.",
     )
-    scene, state, _, _ = check_inputs(scene, state, jnp.stack([jnp.zeros_like(dt), dt]), None)
+    lib: Any = numbers(dt)
+    scene, state, _, _ = check_inputs(scene, state, lib.stack([lib.zeros_like(dt), dt]), None)
     places = () if free is None else places_of(scene, free)
     if not set(places).isdisjoint(_starts_of_loose(scene)):
         raise ValueError(
@@ -156,8 +158,15 @@ def propagate(
     return Propagation(state, jacobian, noise)
 
 
+def _number(value: Any, dtype: Any) -> Array | np.ndarray:
+    """A number of the dtype, in NumPy where it is known: an operation of JAX takes 50 us."""
+    is_plain = isinstance(value, float | int | np.floating | np.integer)
+    return np.asarray(value, dtype) if is_plain else jnp.asarray(value, dtype)
+
+
 def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
-    """The leaves of the scene that give initial speeds of wheels that are not held."""
+    """Indices of the leaves of the scene that are initial speeds or momenta of wheels that are not
+    held."""
 
     def starts(scene):
         if isinstance(scene.rotors, Wheels):
@@ -170,10 +179,10 @@ def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
     return places_of(scene, starts)
 
 
-@eqx.filter_jit
+@jit_distinct
 def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
-    """Also the angle turned by the largest body rate, and whether times near ``t`` resolve ``dt``;
-    the effect of a disturbance in ``parts``."""
+    """State, Jacobian, effect of a disturbance (integrated in ``parts``), status, the angle of
+    rotation by the largest body rate, and whether times close to ``t`` resolve ``dt``."""
     dtype = dt.dtype
     leaves, tree = jax.tree.flatten(scene)
     sizes = [leaves[k].size for k in places]
@@ -184,8 +193,8 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     begin = 6 + len(loose)
     n = begin + sum(sizes)
 
-    # Where time does not matter, the step starts at zero: in single precision t + dt is rounded, by
-    # a fifth of a step of 10 ms after a day.
+    # If the scene does not depend on time, the step starts at t = 0: in single precision t + dt is
+    # rounded, after a day by a fifth of a step of 10 ms.
     dynamics, like = initial_scene.dynamics, state.omega_body[..., 0]
     spins = dynamics.wheels.initial_spins(like) if dynamics.coupled else ()
     changes = initial_scene.with_spins(spins).changes
@@ -194,7 +203,7 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
         t = jnp.zeros_like(t)
     is_resolved = jnp.abs((t + dt) - t - dt) <= _ROUNDED * jnp.abs(dt)
     time_range = jnp.stack([t, t + dt])
-    # In closed form there is no motion under a torque: its effect is integrated over the step.
+    # A closed form does not permit a torque: its effect is integrated over the step.
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes = ((1 + nodes) / 2 + np.arange(parts)[:, None]).reshape(-1) / parts
     weights = np.tile(weights / 2, parts) / parts

@@ -1,4 +1,5 @@
-"""Motion under commands that are held: one integration from every edge or sample to the next."""
+"""Motion under sampled commands (zero-order hold): one integration for each interval between
+periods and saved times."""
 
 import dataclasses
 from typing import Any
@@ -20,8 +21,8 @@ from polhode._trajectory import Trajectory, with_initial_spins
 from polhode._trajectory._trajectory import AbstractPropagator
 
 _COINCIDENT = 1e-9
-"""Part of a period below which a sample and the start of a period are one time; in addition eight
-units in the last place of the times, which single precision rounds far more."""
+"""[periods] Distance below which a saved time and the start of a period are the same time; or eight
+units in the last place of the times, if these are larger, as in single precision."""
 
 
 def is_sampled(scene: Scene) -> bool:
@@ -34,7 +35,8 @@ def sampled_method(
 ) -> "HeldCommands":
     """The method for a scene with a ``SampledTorque``; ``method``: that of each segment, or None.
 
-    Raises ValueError for what is not possible with it.
+    Raises ValueError for different periods, for ``Record(work=True)``, and for times that are not
+    one row of concrete numbers.
     """
     sampled_torques = [term for term in summands(scene.torque) if isinstance(term, SampledTorque)]
     periods = {term.period for term in sampled_torques}
@@ -56,10 +58,11 @@ def sampled_method(
 
 
 class HeldCommands(AbstractMethod):
-    """Commands held from edge to edge; ``method`` integrates each segment.
+    """Commands that are constant from edge to edge; ``method`` integrates each segment.
 
-    ``times`` (M + 1,): edges and samples in order; ``edges`` (M,): whether a segment starts at an
-    edge; ``places`` (T,): of the samples in ``times``.
+    An *edge* is the start of a period, at which new commands are computed. ``times`` (M + 1,):
+    edges and saved times in order; ``edges`` (M,): whether a segment starts at an edge; ``places``
+    (T,): indices of the saved times in ``times``.
     """
 
     method: AbstractMethod
@@ -70,7 +73,7 @@ class HeldCommands(AbstractMethod):
 
     @classmethod
     def of(cls, method: AbstractMethod, ts: np.ndarray, period: float) -> "HeldCommands":
-        """For samples at ``ts`` (T,) and edges in every ``period`` from the first of them on."""
+        """For saved times ``ts`` (T,), and an edge every ``period`` from the first of them on."""
         rounding = 8 * float(np.finfo(ts.dtype).eps) * float(np.max(np.abs(ts)))
         ts = ts.astype(float)
         sign, start = np.sign(ts[-1] - ts[0]), ts[0]
@@ -79,7 +82,7 @@ class HeldCommands(AbstractMethod):
         phase = np.where(is_near_edge, np.round(phase), phase)
         edges = np.arange(np.ceil(phase[-1]))
         all_phases = np.union1d(edges, phase)
-        # samples as they are given, edges between them
+        # saved times exactly as passed, edges between them
         times = start + sign * period * all_phases
         places = np.searchsorted(all_phases, phase)
         times[places] = ts
@@ -87,12 +90,12 @@ class HeldCommands(AbstractMethod):
 
     @property
     def keeps_rtol(self) -> bool:
-        """Whether the segments do."""
+        """Whether the method of the segments does."""
         return self.method.exact or self.method.keeps_rtol
 
     @property
     def name(self) -> str:
-        """That of the segments."""
+        """The name, with that of the segments' method."""
         return f"HeldCommands({self.method.name})"
 
     def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
@@ -156,8 +159,9 @@ class HeldCommands(AbstractMethod):
 
 
 def _commandable(commanded, t: Array, wxyz: Array, omega: Array) -> tuple[State, Array]:
-    """``sound_state`` of the samples, in programs of derivatives also where a command is not
-    finite: zero times its slope would reach the parameters of the law."""
+    """``sound_state`` of the samples. In programs that compute derivatives, a body with a command
+    that is not finite counts as failed, because zero times its derivative is NaN and would be added
+    to the cotangents of the law's parameters."""
     state, _ = sound_state(State.of_samples(wxyz, omega))
     commands = jax.lax.stop_gradient(commanded(t, state))
     is_defined = jnp.isfinite(sum(x.sum(-1, keepdims=True) for x in commands))
@@ -166,7 +170,7 @@ def _commandable(commanded, t: Array, wxyz: Array, omega: Array) -> tuple[State,
 
 
 class HeldPropagator(AbstractPropagator):
-    """Of a trajectory with a command that its samples do not contain."""
+    """The propagator of a trajectory under commands, which its samples do not contain."""
 
     def at(self, trajectory: Trajectory, t: ArrayLike) -> Trajectory:
         raise ValueError(
@@ -176,7 +180,8 @@ class HeldPropagator(AbstractPropagator):
 
 
 def _share(state: State, times: Array, rtol: Array) -> Array:
-    """Tolerance of a segment: that of a radian, where errors add up over the whole angle."""
+    """Tolerance of a segment: ``rtol`` divided by the total angle [rad], because the errors of the
+    segments add up, or by the root of the number of segments if that is larger."""
     rates = jnp.linalg.norm(jax.lax.stop_gradient(state.omega_body), axis=-1)
     rates = jnp.where(jnp.isfinite(rates), rates, 0)  # of a body that failed
     angle = jnp.max(rates, initial=0) * jnp.abs(times[-1] - times[0])

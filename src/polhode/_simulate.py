@@ -1,4 +1,4 @@
-"""The one entry point: a scene, a state and times give a trajectory."""
+"""``ph.simulate`` and ``ph.explain``: input checks, choice of the method, and the compiled call."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -81,24 +81,24 @@ def simulate(
     - ``rtol``: bound of the accumulated local error at the saved times, of the attitude in radians
       and of the momentum relative to its size; None: 1e-9 in float64, 1e-5 in float32. Closed
       forms ignore it. What it controls and what not: docs/methods.md, "What `rtol` means".
-    - ``record``: what is saved; None: attitude and rates at all times. A function of the motion
-      in their place: ``ph.Record(save=fn)``.
+    - ``record``: what is saved; None: attitude and rates at all times. ``ph.Record(save=fn)`` saves
+      a function of the motion instead.
     - ``until``: a ``ph.Event`` at which each body stops. Its times and samples from there on are
       those of the event, so that ``Trajectory.last`` is the state from which to continue;
       ``Trajectory.event_time`` is inf for a body without an event. The cost depends on the time
       of the last event of the batch, not on the last of ``ts``. Times and states have first and
       second derivatives; a third one raises NotImplementedError.
     - ``events``: one or several ``ph.Event``, searched for while the motion is integrated:
-      ``Trajectory.events`` holds times, states and which event it was, in the order of the motion.
-      A body stops at an event with ``terminal=True`` as with ``until``. One that meets more events
-      than the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form
-      is searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
-    - ``throw``: whether a body that did not finish raises. None: ``ph.SimulationError`` where the
-      status is known, as it is in ``jax.grad`` outside of ``jit``; under ``jit`` or ``vmap``
-      nothing is raised: check ``Trajectory.status``. True: there too, when the compiled program
-      runs (by ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``, an error of JAX
-      under ``jax.jit``). False: never. The states of a failed body are NaN from its failure on;
-      for a mean over the others see ``ph.successful_mean``.
+      ``Trajectory.events`` contains their times, states and indices, in the order of the motion. A
+      body stops at an event with ``terminal=True`` as with ``until``. A body with more events than
+      the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form is
+      searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
+    - ``throw``: whether an error is raised if a body did not finish. None: ``ph.SimulationError``
+      if the status is concrete, as it is in ``jax.grad`` outside of ``jit``; under ``jit`` or
+      ``vmap`` nothing is raised: check ``Trajectory.status``. True: under ``jit`` as well, when the
+      compiled program runs (by ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``,
+      an error of JAX under ``jax.jit``). False: never. The states of a failed body are NaN from its
+      failure on; for a mean over the others see ``ph.successful_mean``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.
@@ -130,7 +130,7 @@ def _refuse_events_of_commands(scene: Scene, until, events) -> None:
         return
     raise ValueError(
         "events are not searched for in a scene with a SampledTorque: save the motion at the ends"
-        " of its periods and look there, or use ph.FeedbackTorque."
+        " of its periods and search the samples, or use ph.FeedbackTorque."
     )
 
 
@@ -151,7 +151,7 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
 
 
 def _reduced(trajectory: Trajectory, record: Record) -> Trajectory:
-    """The trajectory with the function that is saved in place of its states, if there is one."""
+    """The trajectory with the values of ``Record(save=)`` instead of its states, if it is set."""
     return trajectory if record.save is None else _with_saved(trajectory, record.save)
 
 
@@ -159,18 +159,18 @@ _with_saved = jit_distinct(with_saved)
 
 
 def checked(trajectory: Trajectory, throw: bool | None) -> Trajectory:
-    """The trajectory; raises for bodies that did not finish, as ``throw`` of ``simulate`` says."""
+    """The trajectory; raises for bodies that did not finish, according to ``throw``."""
     if throw is False:
         return trajectory
     if not isinstance(trajectory.status, Tracer):
         raise_on_failure(trajectory.status)
         return trajectory
-    # by default nothing: the check is a callback, which programs on accelerators wait for
+    # no check by default: it is a callback, and programs on accelerators wait for callbacks
     return _checked_at_run_time(trajectory) if throw else trajectory
 
 
 def _checked_at_run_time(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, its samples and status bound to a check that runs with the program."""
+    """The trajectory, whose samples and status depend on a check in the compiled program."""
     failed = trajectory.status != Status.SUCCESSFUL
     worst = jnp.max(trajectory.status, initial=Status.SUCCESSFUL)
     messages = [f"a body did not finish: {status.explanation}" for status in Status]
@@ -179,7 +179,8 @@ def _checked_at_run_time(trajectory: Trajectory) -> Trajectory:
         saved_values, final = jax.tree.leaves(t._saved), t._final or ()
         return [x for x in (t.ts, *t._samples, t._work, *final, *saved_values) if x is not None]
 
-    # a factor of one: derivatives too use it, of which a program may hold nothing else
+    # The check is a factor of one, so that derivatives depend on it as well, even in a program that
+    # contains nothing else.
     one = eqx.branched_error_if(jnp.ones((), trajectory.ts.dtype), failed, worst, messages)
     bound = [x * one.astype(x.dtype) for x in samples(trajectory)]
     trajectory = eqx.tree_at(samples, trajectory, bound)
@@ -211,7 +212,7 @@ def explain(
 
 @jit_distinct
 def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
-    """The compiled part: lanes out of batches, the method, and back."""
+    """The compiled part: from batches to lanes, the method, and back to batches."""
     state, is_sound = _sound(method, scene, state, ts)
     scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     if split is None:
@@ -256,11 +257,12 @@ def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
 
 
 def _sound(method: AbstractMethod, scene: Scene, state: State, ts: Array) -> tuple[State, Array]:
-    """``sound_state`` in programs of derivatives; in others NaN passes through every method. Bodies
-    with limits or edges that a comparison would take for good ones are not sound in either.
+    """The state and whether it is valid, by ``sound_state``.
 
-    Integrated, a body at rest takes few steps. Closed forms have formulas of their own for rest, so
-    there the body turns.
+    NaN is replaced in programs that compute derivatives; otherwise every method propagates NaN.
+    Bodies with invalid limits or edges (see ``input_conditions``) are never valid. The replacement
+    is a body at rest, which takes few steps to integrate; for closed forms it is a rotating body,
+    because they have separate formulas for a body at rest.
     """
     inputs = jax.tree.leaves(eqx.filter((scene, state, ts), eqx.is_inexact_array))
     rate = 1.0 if method.exact else 0.0
@@ -289,13 +291,13 @@ def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:
 
 
 def _computed(t: Trajectory) -> list[Any]:
-    """What a trajectory holds of the bodies: arrays whose first axes are the batch."""
+    """The computed arrays of a trajectory, whose first axes are those of the batch."""
     samples = [t._wxyz, t._omega_body, t._spins, t._work, t._motor_work, t._saved, t._final]
     return [*samples, t._error, t._ending, t._events]
 
 
 def _begin(method, scene, state, ts, rtol) -> Trajectory:
-    """The state at the first time, as the only sample of a trajectory."""
+    """A trajectory whose only sample is the state at the first time."""
     state = state.as_unit()
     scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     parts = {name: getattr(scene, name) for name in PARTS}
@@ -328,7 +330,7 @@ def _motion_samples(record, method, scene, state, ts, rtol) -> Samples:
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
     are_few = (
         state.wxyz.size <= 4 * _policy.KERNEL_BODIES
-    )  # one task more costs as much as normalising them
+    )  # a task of XLA takes as long as to normalise a few states
     unit = (kernel(State.as_unit) if are_few else State.as_unit)(state)
     lanes = flatten(unit, batch, shared=False)
     times = lane_times(ts, batch)
@@ -340,7 +342,7 @@ def _motion_samples(record, method, scene, state, ts, rtol) -> Samples:
 
 
 def _samples_of_no_body(batch, record, method, scene, state, ts, rtol) -> Samples:
-    """Samples of an empty batch: those of one body tell their shapes, and nothing is computed."""
+    """Samples of an empty batch: their shapes are inferred from those of one body."""
 
     def one(x, rank):
         lead = tuple(max(1, n) for n in x.shape[: x.ndim - rank])
@@ -355,7 +357,7 @@ def _samples_of_no_body(batch, record, method, scene, state, ts, rtol) -> Sample
 def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:
     """Samples of N lanes."""
     run_record = record
-    if record.work and method.exact:  # the rates give the work
+    if record.work and method.exact:  # the work is computed from the rates
         run_record = dataclasses.replace(record, rates=True)
     if record.error:
         samples = _with_error(method, scene, lanes, times, rtol, run_record)
@@ -369,8 +371,8 @@ def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) ->
 
 
 def _saved(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:
-    """Values of the function that is saved, of N lanes: a chunk of bodies at a time is integrated
-    and reduced, so that no more states than those of a chunk are in memory."""
+    """Values of ``Record(save=)`` for N lanes. The motion and its function are computed for one
+    chunk of bodies at a time, so that only the states of a chunk are in memory."""
     lanes_of_batch, shared = eqx.partition((scene, lanes), is_lane_tree((scene, lanes)))
     n, body_times = lanes.wxyz.shape[0], times if times.ndim == 2 else None
     assert record.save is not None
@@ -391,7 +393,8 @@ def _saved(record: Record, method, scene: Scene, lanes: State, times, rtol) -> S
 
 
 def _work_of_exact(scene: Scene, state: State, ts: Array, samples: Samples, record: Record):
-    """Work of the torques in an exact motion: nothing, or what the rates gain (no potential)."""
+    """Work of the torques in a motion in closed form: zero, or the change of the energy (there is
+    no potential)."""
     rows = ts[..., -1:] if record.final_only else ts
     if scene.torque is None:
         return jnp.zeros((state.wxyz.shape[0], rows.shape[-1]), ts.dtype)
@@ -404,20 +407,21 @@ def _work_of_exact(scene: Scene, state: State, ts: Array, samples: Samples, reco
 
 
 _COARSER = 30
-"""How much looser the second run is that an error estimate comes from."""
+"""Ratio of the tolerance of the second run, for the error estimate, to ``rtol``."""
 
 _ROUNDING = 3
-"""Units in the last place of the angle turned that are always added to an estimate."""
+"""Units in the last place of the angle of rotation that are always added to an estimate."""
 
 _ALLOWED = 10
-"""How often an error may exceed the tolerance before the body is called inaccurate."""
+"""Ratio of error to tolerance above which the status is ``INACCURATE``."""
 
 
 def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     """The samples, and for each body the estimated error of its attitude at the last time [rad].
 
-    Two runs differ by the error of the coarser one, the finer one's is smaller by as much as the
-    sum of its steps' errors: how the motion itself spreads errors is the same in both.
+    The difference of two runs is about the error of the coarser one. The error of the finer one is
+    smaller by the ratio of the sums of their estimated errors, since the motion amplifies errors in
+    both runs by the same factor.
     """
     record_of_states = Record(record.attitude, record.rates, record.final_only, record.work)
     size = jnp.linalg.norm(jax.lax.stop_gradient(lanes.omega_body), axis=-1)
@@ -444,7 +448,7 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     if fine.error is None:
         error = gap / _COARSER
     else:
-        steps_differ = coarse.error > 2 * fine.error  # else both took the same steps, few and short
+        steps_differ = coarse.error > 2 * fine.error  # otherwise both took the same few short steps
         share = fine.error / jnp.where(steps_differ, coarse.error - fine.error, 1)
         error = jnp.where(steps_differ, gap * share, jnp.maximum(fine.error, gap))
     error = jax.lax.stop_gradient(error) + _ROUNDING * ulps

@@ -1,6 +1,7 @@
 """Results of fits as dictionaries, JSON, CSV and figures; what limits them."""
 
 import csv
+import dataclasses
 import json
 
 import equinox as eqx
@@ -22,7 +23,7 @@ DRAG, NOISE, TIMES = np.array([0.1, 0.05, 0.2]), 0.01, np.linspace(0.0, 8.0, 25)
 
 @pytest.fixture(scope="module")
 def of_scene():
-    """Moments and drag, whose common size the rates do not show."""
+    """Moments and drag, whose common scale the rates do not determine."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping(DRAG))
     path = ph.simulate(scene, STATE, TIMES).omega_body
     rates = path + NOISE * jax.random.normal(jax.random.key(3), path.shape)
@@ -73,7 +74,7 @@ def test_ratios_are_known_where_only_a_common_factor_is_not(of_scene):
 
 
 def test_residuals_of_readings_are_those_of_the_fit(of_inertia):
-    """Also where a calibrated bias stands between readings and rates, in figures too."""
+    """Also, and in figures, if a calibrated bias relates readings to rates."""
     times, bias = np.linspace(0.0, 20.0, 60), np.array([0.3, -0.2, 0.1])
     rates = ph.simulate(ph.Scene(BODY), STATE, times).omega_body
     rates = rates + NOISE * jax.random.normal(jax.random.key(1), rates.shape)
@@ -113,7 +114,7 @@ def test_the_result_as_json_and_csv(of_scene, of_inertia, tmp_path):
     assert document["scale_known"] is False
     assert document["moments_std"] == [None] * 3
     assert {"inertia", "moments", "ratios", "gain"} <= {r["name"] for r in rows}
-    # what the data do not show has no standard deviation
+    # no finite standard deviation for what the data do not determine
     assert all(r["std"] == "" for r in rows if r["name"] == "moments")
 
 
@@ -125,7 +126,7 @@ def test_what_limits_a_fit_is_said(of_scene, of_inertia):
     part = of_inertia._calibration_part(0)
     assert of_inertia.limit().startswith(f"the calibration of the gyroscope ({part:.0%}")
     assert 0.5 < part <= 1
-    # with the covariance of an exact calibration the noise does
+    # with an exact calibration the noise limits it
     matrix = np.array(of_inertia.covariance)
     own, gain = slice(0, 6), slice(6, 15)
     side = matrix[own, gain]
@@ -145,6 +146,28 @@ def test_a_figure_of_a_batch_needs_its_recording(of_inertia):
     times = np.linspace(0.0, 20.0, 60)
     with pytest.raises(ValueError, match=r"leading axes \(2,\), got \(\)"):
         plot.fit(batch, Recording.of(times, np.ones((60, 3))), body=1)
+
+
+def test_a_figure_of_several_recordings_shows_the_first_and_no_model_at_a_limit(of_inertia):
+    """The first one of a fit is shorter than another; a bound says nothing on the model."""
+    pytest.importorskip("matplotlib")
+    times = np.linspace(0.0, 20.0, 60)[:50]
+    rates = np.asarray(ph.simulate(ph.Scene(BODY), STATE, times).omega_body)
+    limit = rates[:, 0].max() - 0.01
+    recording = Recording.of(times, np.minimum(rates, limit), omega_noise=NOISE)
+    at_limit = np.zeros((50, 3))
+    at_limit[:, 0] = rates[:, 0] > limit
+    recording = dataclasses.replace(recording, saturated=jnp.asarray(at_limit))
+    residual = np.zeros((1, 60, 3))
+    residual[0, :50] = np.where(at_limit, 0, 0.5)
+    fit = eqx.tree_at(lambda f: f.residuals["omega"], of_inertia, jnp.asarray(residual))
+    shown = _single(fit, recording, 0)["model"]
+    expected = np.where(at_limit, np.nan, recording.omega - 0.5 * NOISE)
+    assert 0 < at_limit.sum() < 20
+    np.testing.assert_allclose(shown, expected)
+    other = Recording.of(times[:40], rates[:40], omega_noise=NOISE)
+    with pytest.raises(ValueError, match="the first of those that were fitted, got one of 40"):
+        plot.fit(fit, other)
 
 
 def test_a_figure_of_a_fitted_scene(of_scene):

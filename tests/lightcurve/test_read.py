@@ -1,4 +1,4 @@
-"""Readers of light curves: what they take, what they assume, and what they say of bad files."""
+"""Readers of light curves: accepted formats, assumptions, and errors for invalid files."""
 
 import numpy as np
 import pytest
@@ -36,10 +36,12 @@ def test_table_is_reduced_to_unit_distance_and_to_the_body(table):
     assert np.all(curve.sigma == 0.02)
     cosine = SUN @ OBSERVER / r / delta
     np.testing.assert_allclose(np.cos(curve.alpha), cosine)
+    assert str(curve).startswith("LightCurve: 9 points of 2 group(s), day 2456210.59")
+    assert "median error 0.02, with directions" in str(curve)
 
 
 def test_barycentric_times_are_moved_to_the_body(table):
-    """The Sun, at the origin, stands for the barycentre; the body is at -SUN."""
+    """The Sun, at the origin, represents the barycentre; the body is at -SUN."""
     text = table.read_text()
     observer, delta = OBSERVER - SUN, np.linalg.norm(OBSERVER)
     shift = LIGHT_TIME * observer @ -OBSERVER / delta
@@ -129,6 +131,8 @@ def test_alcdef(tmp_path):
     vectors.write_text(
         "\n".join([header, f"{ends[0]},2,0,0,0,1.5,0", f"{ends[1] + 1},2,0,0,0,1.5,0"])
     )
+    notes = " ".join(lightcurve.read_light_curve(path).notes)
+    assert "times of some sessions keep their light time, those of others are corrected" in notes
     curve = lightcurve.read_light_curve(path, vectors)
     moved = np.where(curve.group == 0, LIGHT_TIME * 1.5, 0)
     np.testing.assert_allclose(curve.t + moved, [*np.sort(JD), *(np.sort(JD) + 1)], atol=1e-9)
@@ -247,6 +251,15 @@ def test_unsorted_times_are_sorted_with_their_points():
     curve = lightcurve.LightCurve.of(t, 15 + t)
     assert np.all(np.diff(curve.t) > 0)
     np.testing.assert_allclose(curve.magnitude, 15 + curve.t)
+
+
+def test_times_that_a_precision_does_not_resolve_are_refused():
+    """A Julian date in single precision, JAX's default, is one of a quarter of a day."""
+    t = 2459000.5 + 0.15 * np.arange(40.0)
+    with pytest.raises(ValueError, match=r"in float32 are resolved to 0\.25 d only"):
+        lightcurve.LightCurve.of(t.astype(np.float32), np.sin(t))
+    since = (t - t[0]).astype(np.float32)
+    np.testing.assert_array_equal(lightcurve.LightCurve.of(since, np.sin(t)).t, since)
 
 
 def test_nothing_of_a_file_is_dropped_in_silence(tmp_path):

@@ -1,16 +1,16 @@
-"""Functions that the closed forms share: double-double sums, polynomials, elliptic series.
+"""Functions common to the closed forms: double-double sums, polynomials, elliptic series.
 
-A ``Pair`` is an unevaluated sum of two floats. Dekker, *A floating-point technique for extending
-the available precision*, Numer. Math. 18 (1971). The halves are separated by masking bits, and only
-exact products are added, so a compiler that contracts a product and a sum into one operation
-changes nothing.
+A ``Pair`` is an unevaluated sum of two floats (Dekker, *A floating-point technique for extending
+the available precision*, Numer. Math. 18 (1971)). Factors are split into halves by masking bits.
+Only exact products are added, so that results do not change if the compiler contracts a product and
+a sum into one operation (FMA).
 
-The polynomials for sines and arctangents are Chebyshev fits to 40 digits, accurate to 1e-17 on
-their intervals. XLA compiles them to vector instructions, which it does not do for its own sine.
+The polynomials for sines and arctangents are Chebyshev fits, computed with 40 digits and accurate
+to 1e-17 on their intervals. XLA compiles them to vector instructions, unlike its own sine.
 
 Elliptic functions and integrals: NIST Digital Library of Mathematical Functions (DLMF), chapters 19
-and 20; B. C. Carlson, Numer. Algorithms 10 (1995) 13. The series hold for a parameter m <= 0.8,
-where they reach the last bit of float64; beyond it callers pass the complementary parameter.
+and 20; B. C. Carlson, Numer. Algorithms 10 (1995) 13. The series are accurate to the last bit of
+float64 for a parameter m <= 0.8; for larger ones callers pass the complementary parameter.
 """
 
 from typing import NamedTuple
@@ -47,13 +47,13 @@ def _masked(x: Scalars, masks: dict) -> Scalars:
 
 
 def split(x: Scalars) -> Pair:
-    """Two halves of x with at most half of the bits each, their sum being exactly x."""
+    """Two floats with at most half of the bits each, whose sum is exactly x."""
     high = _masked(x, _HALF)
     return Pair(high, x - high)
 
 
 def binade(x: Scalars) -> Scalars:
-    """The power of two next below |x|; one for zero."""
+    """The largest power of two that is not above |x|; one for zero."""
     power = _masked(x, _EXPONENT)
     return jnp.where(power > 0, power, 1)
 
@@ -74,8 +74,8 @@ def sum_of(a: Scalars, b: Scalars) -> Pair:
 def product_of(a: Scalars, b: Scalars) -> Pair:
     """a b with its error, to a few units in the last place of the error itself."""
     x, y = split(a), split(b)
-    # Added as plain floats, the products of a high and a low half would lose a quarter of the
-    # digits of the error.
+    # If the products of a high and a low half were added as plain floats, the error would lose a
+    # quarter of its digits.
     middle = sum_of(x.high * y.low, x.low * y.high)
     total = sum_of(x.high * y.high, middle.high)
     return quick_sum(total.high, total.low + (middle.low + x.low * y.low))
@@ -115,12 +115,13 @@ def root_of(x: Pair) -> Pair:
 
 
 def whole_and_fraction(rate: Scalars, time: Scalars) -> tuple[Scalars, Scalars]:
-    """rate * time as a whole number and a remainder in [-1/2, 1/2], nothing lost to its size."""
+    """rate * time as a whole number and a remainder in [-1/2, 1/2], without loss of digits for
+    large products."""
     x, y = split(rate), split(time)
     product = rate * time
     integer = jnp.round(product)
     remainder = (x.high * y.high - integer) + (x.high * y.low + x.low * y.high) + x.low * y.low
-    # The low parts of a tiny product would underflow.
+    # the low parts of very small factors underflow
     return integer, jnp.where(integer == 0, product, remainder)
 
 
@@ -159,7 +160,7 @@ _ARCTANGENT = (
 
 
 def horner(coefficients, x: Scalars) -> Scalars:
-    """Polynomial with the coefficients in rising order."""
+    """Polynomial with coefficients in ascending order."""
     total = coefficients[-1]
     for c in coefficients[-2::-1]:
         total = total * x + c
@@ -172,7 +173,7 @@ def sine_half(x: Scalars) -> Scalars:
 
 
 def sinh(x: Scalars) -> Scalars:
-    """Hyperbolic sine, exact to rounding also for small x."""
+    """Hyperbolic sine, accurate to rounding for small x as well."""
     growth = jnp.exp(jnp.abs(x))
     large = jnp.copysign((growth - 1 / growth) / 2, x)
     return jnp.where(jnp.abs(x) < 1, x * horner(_SINH, x * x), large)
@@ -198,7 +199,7 @@ def sign_of_parity(integer: Scalars) -> Scalars:
 
 
 def nome_per_lambda(lam: Array) -> Array:
-    """q over lambda = (1 - sqrt k') / (2 (1 + sqrt k')), to float64 for m <= 0.8: DLMF 20.9.2."""
+    """q / lambda, where lambda = (1 - sqrt k') / (2 (1 + sqrt k')), for m <= 0.8: DLMF 20.9.2."""
     z = lam * lam
     z = z * z
     return 1 + z * (2 + z * (15 + z * (150 + z * (1707 + z * 20910))))
@@ -206,8 +207,8 @@ def nome_per_lambda(lam: Array) -> Array:
 
 def nome_per_parameter(m: Array, fourth_root: Array) -> Array:
     """q/m, which is regular at m = 0; ``fourth_root``: of the complementary parameter 1 - m."""
-    # lambda / m without the cancellation of 1 - sqrt k' at small m: both factors of
-    # m = (1 - sqrt k') (1 + sqrt k') (1 + k') that do not vanish are divided out.
+    # lambda / m without the cancellation in 1 - sqrt k' at small m: in
+    # m = (1 - sqrt k') (1 + sqrt k') (1 + k') the first factor cancels.
     share = 1 / (2 * (1 + fourth_root * fourth_root) * (1 + fourth_root) ** 2)
     return share * nome_per_lambda(share * m)
 
@@ -254,7 +255,7 @@ def rd_series(x: Array, y: Array, z: Array) -> Array:
 
 
 AGM_STEPS = 5
-"""Steps of the arithmetic-geometric mean, which reach rounding from a ratio of sqrt(0.2)."""
+"""Steps of the arithmetic-geometric mean: sufficient for ratios of sqrt(0.2) and larger."""
 
 
 def agm_and_nome(circular, on_separatrix, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
@@ -262,8 +263,8 @@ def agm_and_nome(circular, on_separatrix, x: Scalars, m: Scalars, m1: Scalars, o
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
     omega = jnp.sqrt(x)
-    # Quadratic convergence: from b >= sqrt(0.2) the fifth mean is exact to rounding. A fixed number
-    # of steps keeps all lanes in one kernel.
+    # Quadratic convergence: from b >= sqrt(0.2) on the fifth mean is accurate to rounding. The
+    # number of steps is the same for all lanes, without a loop.
     a, b = 1.0, other
     for _ in range(AGM_STEPS - 1):
         a, b = (a + b) / 2, jnp.sqrt(a * b)

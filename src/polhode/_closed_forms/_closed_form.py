@@ -1,4 +1,4 @@
-"""What closed forms have in common: the abstract method, chunks of bodies, conditions on scenes."""
+"""The base of the closed forms: the abstract method, chunks of bodies, conditions on scenes."""
 
 import abc
 from typing import Any, ClassVar
@@ -16,23 +16,25 @@ from polhode.inertia import Symmetry, VariableInertia
 
 
 class AbstractClosedForm(AbstractMethod):
-    """A closed-form solution as a method: nothing is integrated."""
+    """A closed-form solution as a method."""
 
     exact: ClassVar[bool] = True
 
     @abc.abstractmethod
     def objection(self, scene: Scene) -> str | None:
-        """What is wrong with the parts of the scene, whatever their values; None: nothing."""
+        """Why the solution is not valid for these parts, whatever their numbers; None if it may
+        be."""
 
     @abc.abstractmethod
     def why_not(self, scene: Scene) -> str | None:
-        """Why the types of the parts do not make the solution valid; None: they do.
+        """Why the types of the parts do not guarantee that the solution is valid; None if they do.
 
-        Numbers are not read: plain calls, ``jit``, ``vmap`` and ``grad`` choose alike.
+        It does not depend on numbers, so that the choice of the method is the same under ``jit``,
+        ``vmap`` and ``grad``.
         """
 
     def refuse(self, scene: Scene) -> None:
-        """ValueError where the solution does not hold for the parts of the scene."""
+        """ValueError if the solution is not valid for the parts of the scene."""
         variable = isinstance(scene.inertia, VariableInertia)
         objection = VARIABLE if variable else self.objection(scene)
         if objection is not None:
@@ -46,9 +48,9 @@ class AbstractChunkedForm(AbstractClosedForm):
     def _motion(
         self, scene: Scene, state: State, elapsed: Array
     ) -> tuple[Array | None, Array, Array]:
-        """wxyz (N, T, 4), omega_body (N, T, 3), and for which bodies (N,) the solution holds.
+        """wxyz (N, T, 4), omega_body (N, T, 3), and for which bodies (N,) the solution is valid.
 
-        ``elapsed`` (N, T) [s]: since ``state``.
+        ``elapsed`` (N, T) [s]: time since ``state``.
         """
 
     @abc.abstractmethod
@@ -80,7 +82,7 @@ class AbstractChunkedForm(AbstractClosedForm):
 
 
 def bodies_per_chunk(chunk: int | None, n: int, count: int) -> int:
-    """Bodies so that ``chunk`` bounds bodies times samples; None: all of them."""
+    """Number of bodies for at most ``chunk`` bodies times samples; None: all of them."""
     return n if chunk is None else max(1, chunk // count)
 
 
@@ -122,7 +124,7 @@ def broadcast(*arrays):
 
 
 def wheel_objection(scene: Scene) -> str | None:
-    """Objection to rotors other than wheels on body z that are held at their speed, by type."""
+    """Objection to rotors other than held wheels on body z, by type."""
     rotors = scene.rotors
     if rotors is None:
         return None
@@ -133,7 +135,7 @@ def wheel_objection(scene: Scene) -> str | None:
         are_held = tuple(wheel.is_held for wheel in rotors.wheels)
     if any(axis != 2 for axis in axes):
         return NOT_AXIAL
-    return None if all(are_held) else "a motor turns a rotor, or it spins freely"
+    return None if all(are_held) else "a rotor spins freely or is driven by a motor"
 
 
 VARIABLE = "the inertia changes with time"
@@ -142,7 +144,7 @@ NOT_PRINCIPAL = "the body axes are not principal axes by the type of the inertia
 
 
 def symmetry_objection(scene: Scene) -> str | None:
-    """Objection to an inertia that is not symmetric about body z by its type."""
+    """Objection to an inertia whose type does not guarantee symmetry about body z."""
     inertia = scene.inertia
     if inertia.is_principal and inertia.symmetry is not Symmetry.NONE:
         return None
@@ -150,7 +152,7 @@ def symmetry_objection(scene: Scene) -> str | None:
 
 
 def axial_state(scene: Scene, state: State) -> tuple[Array, Array, Array]:
-    """Moments A, C of the carrier, and the axial momentum, of lanes."""
+    """Transverse moment (N,), principal moments (N, 3) of the carrier, and axial momentum (N,)."""
     n = state.wxyz.shape[0]
     moments = as_lanes(scene.carrier.moments, n, 1)
     axial = moments[:, 2] * state.omega_body[:, 2] + axial_wheel_momentum(scene, n)
@@ -166,7 +168,7 @@ def axial_wheel_momentum(scene: Scene, n: int) -> Array:
 
 
 def wheels_have_constant_momentum(scene: Scene, n: int) -> Array:
-    """Lanes on which no motor turns a wheel."""
+    """Whether (N,) the momenta of all wheels are constant: no motor or coupling acts on them."""
     wheels: Any = scene.rotors
     if wheels is None:
         return jnp.ones(n, bool)

@@ -1,4 +1,4 @@
-"""Symmetric tops and bodies on a fixed axis: driven and damped spin in elementary functions."""
+"""Symmetric tops and rotation about a fixed axis, driven and damped, in elementary functions."""
 
 import equinox as eqx
 import jax
@@ -29,16 +29,16 @@ class SymmetricTop(AbstractChunkedForm):
     """A symmetric body without potential, in elementary functions: exact.
 
     Constant torque about the axis of symmetry (body z), linear damping symmetric about it and
-    wheels of constant momentum on it. The rates are elementary functions in all these cases, the
-    attitude only where the momentum keeps its direction: without torque, and with no damping, or
-    with damping proportional to the moments (``c = k I``) and no wheel. Otherwise the attitude is
-    NaN: pass ``ph.Record(attitude=False)``.
+    wheels of constant momentum on it. The rates are elementary functions in all these cases. The
+    attitude is one only if the direction of the momentum is constant: without torque, and without
+    damping, or with damping proportional to the moments (``c = k I``) and no wheel. Otherwise the
+    attitude is NaN: pass ``ph.Record(attitude=False)``.
 
-    Derivatives are those within these motions: by numbers that break their symmetry, such as one of
-    two equal coefficients of damping, they are zero or wrong. Those of the attitude by damping and
-    moments hold in sums along ``c = k I`` only, so that the one by axial damping alone is zero; by
-    axial torque, by the momentum of a wheel beside damping and by damping beside a wheel they are
-    NaN. Those of ``ph.LiePoisson()`` are right.
+    Derivatives are those within this class of motions: by numbers that break the symmetry, such as
+    one of two equal coefficients of damping, they are zero or wrong. Derivatives of the attitude by
+    damping and moments are valid only for changes that preserve ``c = k I``; the one by axial
+    damping alone is zero. Those by axial torque, by the momentum of a wheel in a damped body and by
+    damping of a body with a wheel are NaN. Those of ``ph.LiePoisson()`` have no such restrictions.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)
@@ -101,11 +101,11 @@ class SymmetricTop(AbstractChunkedForm):
 
 
 def _zero_of_fixed_direction(torque: Array, damping: Array, wheel_momentum: Array) -> Array:
-    """Zero (N,), with NaN for its derivatives by numbers that turn a momentum of fixed direction.
+    """Zero (N,), whose derivatives are NaN by numbers that would change the momentum's direction.
 
-    The attitude has no formula for a momentum that turns, nor derivatives towards one. Damping
-    alone is not marked: in reverse mode its two coefficients would be NaN also where they stay
-    proportional to the moments.
+    The formula of the attitude requires a constant direction, and so do its derivatives. Damping
+    alone is not included: in reverse mode its two coefficients would have NaN derivatives even if
+    their change preserves the proportion to the moments.
     """
     marked = (
         (torque, jnp.ones_like(torque, bool)),
@@ -121,18 +121,18 @@ def _chunk_size(chunk: int | None, n: int, count: int) -> int:
 
 
 def _equal(a: Array, b: Array) -> Array:
-    """Equal to a few units in the last place: ratios of what was meant to be proportional."""
+    """Equal to a few units in the last place: the ratios of proportional numbers are rounded."""
     return jnp.abs(a - b) <= 4 * jnp.finfo(a.dtype).eps * jnp.abs(a)
 
 
 class FixedAxis(AbstractChunkedForm):
     """Rotation about a fixed principal axis, driven and damped, in closed form.
 
-    All rates but one are zero at the start, the constant body torques lie along that axis and the
-    damping is linear: d omega/dt = (N - c omega)/I. The axis may differ from body to body.
-    Derivatives with respect to transverse rates and torques are zero, those of this motion only.
-    Second ones of a body at rest are NaN. Bodies with other rates or torques have NaN and
-    ``ph.Status.NOT_FINITE``: ``ph.simulate`` never chooses this method itself.
+    All rates but one are zero at the start, the constant body torques are along that axis and the
+    damping is linear: d omega/dt = (N - c omega)/I. Bodies may have different axes. Derivatives are
+    those within this class of motions: with respect to transverse rates and torques they are zero.
+    Second derivatives of a body at rest are NaN. For bodies with other rates or torques results are
+    NaN with ``ph.Status.NOT_FINITE``: ``ph.simulate`` never chooses this method by itself.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)
@@ -159,15 +159,15 @@ class FixedAxis(AbstractChunkedForm):
         axis = jnp.argmax(is_axis, axis=-1)
         along = jnp.arange(3)[None] == axis[:, None]
         is_moving = jnp.any(is_axis, axis=-1, keepdims=True)
-        # Across the axis of a body that turns nothing is differentiated; at rest the equations are
-        # coupled in second order only.
+        # Derivatives by transverse rates and torques of a rotating body are set to zero. At rest
+        # the axes are coupled in second order only, and first derivatives by all of them are right.
         constant = jax.lax.stop_gradient
         rates, torque = (
             jnp.where(along | ~is_moving, x, constant(x)) for x in (state.omega_body, torque)
         )
         rates_and_torque = jnp.concatenate([rates, torque], axis=-1)
         at_rest = jnp.broadcast_to(~is_moving, rates_and_torque.shape)
-        # Zero, and NaN in second derivatives of a body at rest, which are not those of this motion.
+        # Zero, whose second derivatives are NaN for a body at rest, since this motion lacks them.
         zero = jnp.sum(
             derivable_once(rates_and_torque, at_rest) - rates_and_torque, axis=-1, keepdims=True
         )
@@ -222,7 +222,7 @@ def driven_spin(
 
 
 def rotation_about(axis: tuple[Array, Array, Array], angle: Array) -> Float[Array, "*b 4"]:
-    """Unit quaternion of a turn by ``angle`` [rad] about the unit ``axis``."""
+    """Unit quaternion of a rotation by ``angle`` [rad] about the unit ``axis``."""
     c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
     return jnp.stack(jnp.broadcast_arrays(c, *(s * a for a in axis)), axis=-1)
 
@@ -234,11 +234,11 @@ def precession(
     axial_rate: Array,
     elapsed: Float[Array, "*b t"],
 ) -> Float[Array, "*b t 4"]:
-    """Attitude of a symmetric body whose momentum keeps its direction (regular precession).
+    """Attitude of a symmetric body whose momentum has a constant direction (regular precession).
 
-    The axis turns about ``momentum_space`` at |L|/A while the body turns about its axis at
+    The axis rotates about ``momentum_space`` at |L|/A, and the body about its axis at
     ``axial_rate`` = omega_z - L_z/A [rad/s]; ``elapsed``: time, or the integral of the factor by
-    which both decay.
+    which both rates decay.
     """
     rate = momentum_space / transverse[..., None]
     outer = rotation_vector_to_wxyz(rate[..., None, :] * elapsed[..., None])  # regular at rest

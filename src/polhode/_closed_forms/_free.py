@@ -32,15 +32,15 @@ from polhode.inertia import Symmetry, principal
 class ClosedForm(AbstractClosedForm):
     """The exact free motion in Jacobi elliptic functions, O(1) in time, for every inertia.
 
-    Bodies known to be axisymmetric or spherical (``ph.Inertia.axisymmetric``, ``spherical``) use
-    circular functions only. Needs a scene without potential and torque. The error is rounding: a
-    few units in the last place of the phase. ``chunk`` bounds the bodies times samples worked on at
-    once; None: chosen by the library. Steps are reported as 0.
+    For bodies of symmetric type (``ph.Inertia.axisymmetric``, ``spherical``) the functions are
+    circular. The scene must have no potential and no torque. The error is rounding: a few units in
+    the last place of the phase. ``chunk``: maximum bodies times samples that are computed at once;
+    None: chosen by the library. Steps are reported as 0.
 
-    ``compensated``: frequencies in sums of two floats, so that over a long horizon the error no
-    longer grows with the phase. It costs a few hundred nanoseconds per body, and 2 per sample, and
-    no digit elsewhere. Bodies known to be symmetric have none of it; nor have, in float64, bodies
-    within 1e-15 of the separatrix or of a symmetry.
+    ``compensated``: frequencies as sums of two floats, so that the error does not grow with the
+    phase over a long horizon. This takes a few hundred nanoseconds per body and 2 ns per sample.
+    It has no effect on bodies of symmetric type, nor, in float64, on bodies within 1e-15 of the
+    separatrix or of a symmetry.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)
@@ -91,7 +91,7 @@ class ClosedForm(AbstractClosedForm):
         time_by_time = (
             self.chunk is None and motion is _triaxial and _policy.is_time_loop(n, samples)
         )
-        if single_body:  # one body at many times: as several bodies, each at a part of them
+        if single_body:  # one body at many times is computed as several bodies at a part of them
             pieces = -(-samples // chunk)
             samples_per_piece = -(-samples // pieces)
             times = jnp.pad(t.reshape(-1), (0, pieces * samples_per_piece - samples), mode="edge")
@@ -136,14 +136,14 @@ class ClosedForm(AbstractClosedForm):
 
 
 def _in_axes(axes, wxyz, omega):
-    """Attitude and rates of the frame that ``axes`` (wxyz) turns the body's into."""
+    """Attitude and rates in the principal axes, which result from the body's by ``axes`` (wxyz)."""
     return rotation.multiply(wxyz, axes), rotation.rotate(rotation.conjugate(axes), omega)
 
 
 def _triaxial(moments, products, wxyz, omega, t, requested):
     if t.shape[-1] > 1:
         return free_motion(moments, wxyz, omega, t, products, **requested)
-    # One time per body has kernels of its own, nearly twice as fast.
+    # For one time per body there is a separate kernel, nearly twice as fast.
     motion = free_motion(moments, wxyz, omega, t[:, 0], products, **requested)
     return jax.tree.map(lambda x: x[:, None], motion)
 
@@ -175,9 +175,9 @@ def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -
     **Arguments:** principal ``moments`` (..., 3), positive, in any order; initial attitude
     ``wxyz`` (..., 4), or None where only rates are requested; initial body rates ``omega``
     (..., 3) along the principal axes; ``products`` (..., 3), the entries xy, xz, yz of the inertia
-    tensor, of value zero: they only carry tangents. Each may be a tuple of component arrays; all
-    components share one shape, the batch. ``compensated``: the frequencies in sums of two floats,
-    for long horizons.
+    tensor, whose values are zero and which are needed for derivatives only. Each may be a tuple of
+    component arrays; all components have one shape, that of the batch. ``compensated``: the
+    frequencies as sums of two floats, for long horizons.
     """
     moments, omega = as_components(moments), as_components(omega)
     products = None if products is None else as_components(products)
@@ -192,7 +192,7 @@ def evaluate(
     """Body rates and attitude at times ``t`` from the start, as tuples of component arrays.
 
     ``t`` has the rank of the batch and broadcasts with it, or one trailing axis more: the times
-    of each body. Times may be negative. What is not requested is None and costs nothing.
+    of each body. Times may be negative. Results that are not requested are None and not computed.
     """
     batch = motion.moments[0].ndim
     t = jnp.asarray(t)
@@ -213,7 +213,7 @@ def evaluate(
         motion.wxyz if attitude else None,
         t,
     )
-    # Derivatives do not pass through the constants (see ``_free_derivatives``).
+    # The constants are not differentiated (see ``_free_derivatives``).
     constants = jax.lax.stop_gradient((motion.polhode, precession))
     return _evaluate((attitude, rates, has_time_axis), constants, arguments)
 
@@ -231,12 +231,13 @@ def free_motion(
 ) -> tuple[Triple | None, Quadruple | None]:
     """The exact free motion: `prepare` and `evaluate` in one call.
 
-    A long batch of one axis is worked off in chunks that fit the cache of a processor core.
+    A long batch of one axis is computed in chunks that fit into the cache of a processor core.
 
-    First and second derivatives, forward and reverse, are exact in every regime, with two limits
-    on second ones: those by ``products`` lose digits in proportion to the inverse relative
-    difference of two moments, and are NaN where two agree to half of their digits; those by the
-    rates lose the ratio of a radian to the angle turned through, except at rest.
+    First and second derivatives, in forward and reverse mode, are accurate to rounding for all
+    motions, with two exceptions for second derivatives. The relative error of those by ``products``
+    grows with the inverse relative difference of two moments, and they are NaN if two agree to half
+    of their digits. The relative error of those by the rates grows with one radian over the angle
+    of rotation, except at rest.
     """
     parts = (
         as_components(moments),
@@ -260,16 +261,16 @@ def free_motion(
 
     chunk = _policy.samples_at_once(_policy.FREE_CHUNK)
     if t.ndim <= parts[0][0].ndim:
-        # With one time a body, derivatives work everything out again: storing the coefficients,
-        # hundreds of them, takes longer, and Hessians compile in minutes. With many times storing
-        # them takes less time to compile.
+        # With one time per body, derivatives evaluate the motion again: to store the hundreds of
+        # coefficients takes longer, and Hessians would take minutes to compile. With many times,
+        # the program that stores them compiles faster.
         return _chunked(kernel(whole_motion, repeated=True), parts, t, chunk)
     rows = max(1, chunk // max(t.shape[1] if t.ndim == 2 else 1, 1))
     return _chunked(kernel(whole_motion, linearised=True), parts, t, rows)
 
 
 def _time_by_time(arguments, t, compensated: bool, requested):
-    """The motion of many bodies, one time after the other; the constants are computed once."""
+    """The motion of many bodies in a loop over the times; the constants are computed once."""
 
     def constants(arguments):
         motion = prepare(*arguments, compensated=compensated)
@@ -281,15 +282,15 @@ def _time_by_time(arguments, t, compensated: bool, requested):
         moments, wxyz, omega, products = arguments
         return evaluate(FreeConstants(moments, products, omega, wxyz, *prepared), t, **requested)
 
-    # Coefficients of the derivative are computed again where they are used: storing them for all
-    # times takes longer, because memory bandwidth limits it.
+    # Coefficients of the derivative are computed again where they are used: to store them for all
+    # times takes longer, because of the memory bandwidth.
     at_time = jax.checkpoint(kernel(at, linearised=True), prevent_cse=False)
     samples = jax.lax.map(lambda t: at_time(arguments, prepared, t), t.T)
     return jax.tree.map(jnp.transpose, samples)
 
 
 def chunk_size(count: int, largest: int = _policy.FREE_LANES) -> int:
-    """Bodies of a chunk: if possible a divisor, which spares the copies that padding makes."""
+    """Bodies of a chunk: if possible a divisor of ``count``, so that no array is padded."""
     if count < 2 * largest:
         return count
     return next(
@@ -298,7 +299,7 @@ def chunk_size(count: int, largest: int = _policy.FREE_LANES) -> int:
 
 
 def _chunked(fn, parts, t, rows):
-    """``fn(parts, t)``, ``rows`` bodies at a time where a processor has many to do."""
+    """``fn(parts, t)``, for large batches in chunks of ``rows`` bodies."""
     lanes = parts[0][0]
     if lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
         return fn(parts, t)
@@ -335,7 +336,7 @@ def _evaluate(requested, constants, arguments):
 def _evaluate_rule(requested, primals, tangents):
     (polhode, precession), arguments = primals
     t = jax.lax.stop_gradient(arguments[-1])
-    # The tangent has many kernels, and each would repeat the motion itself.
+    # In finer stages: the tangent consists of many loops, and XLA would repeat the motion in each.
     at = advance(polhode, precession, t, fine=True)
     motion = EvaluatedMotion(polhode, precession, at, _results(requested, polhode, precession, at))
     return results_rule(requested, (motion, arguments), (None, tangents[1]))
@@ -362,15 +363,15 @@ def symmetric_motion(
 ) -> SymmetricMotion:
     """Regular precession of a body with equal moments about body x and y.
 
-    ``moments`` (..., 3) [kg m^2], the first two taken as equal; ``t`` (...) [s] since the state
-    ``wxyz``, ``omega_body`` held. The body turns about its axis at ``lambda = (1 - I3/I1) w3`` and
-    with that about the constant momentum at ``|L|/I1``.
+    ``moments`` (..., 3) [kg m^2], of which the first two are assumed equal; ``t`` (...) [s] since
+    the state ``wxyz``, ``omega_body``. The body rotates about its axis at ``lambda = (1 - I3/I1)
+    w3``, and its axis about the constant momentum at ``|L|/I1``.
     """
     transverse, axial = moments[..., 0], moments[..., 2]
     slip = (transverse - axial) / transverse * omega_body[..., 2]
     later = later_rates = None
     if rates:
-        # Here and below: once, and not anew for each component of what follows.
+        # here and below: computed once, not again for each component of the result
         cos, sin = computed_once((jnp.cos(slip * t), jnp.sin(slip * t)))
         x, y = omega_body[..., 0], omega_body[..., 1]
         spin = jnp.broadcast_to(omega_body[..., 2], cos.shape)

@@ -1,16 +1,16 @@
 """The constants of the exact free motion; (n) are formulas of docs/free_motion.md.
 
 ``assign_roles`` orders and scales the axes; ``polhode_constants`` and ``precession_constants``
-compute what depends on the body and its initial state alone. ``staged`` keeps XLA from repeating
-earlier arithmetic in every kernel that uses it.
+compute the constants that depend on the body and its initial state alone. ``staged`` prevents XLA
+from repeating earlier arithmetic in every loop that uses its results.
 
-``compensated_constants`` contains the rounding errors of the two frequencies as well: over a long
-horizon the error of the exact motion is that of its phases, one unit in the last place of the
-frequencies times the time. In single precision the constants are computed in double and rounded. In
-double precision the frequencies come from means in unevaluated sums of two floats: with axis 3 the
-one that the momentum circles, p = |1/I1 - 1/I2|, r = |1/I2 - 1/I3|, s = p + r, the momentum's half
-period is 2 K(m) / omega_p, and the mean rate of the Euler angle about L is
-|L| (1/I3 +- s Pi(-p/r, m) / K(m)), Pi/K by DLMF 19.8.6.
+``compensated_constants`` also computes the rounding errors of the two frequencies: over a long
+horizon the error of the motion is that of its phases, one unit in the last place of the frequencies
+times the time. In single precision the constants are computed in double precision and rounded. In
+double precision the frequencies are computed by arithmetic-geometric means of unevaluated sums of
+two floats. Let axis 3 be the one about which the momentum circulates, p = |1/I1 - 1/I2|, r = |1/I2
+- 1/I3| and s = p + r. Then the half period of the momentum is 2 K(m) / omega_p, and the mean rate
+of the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)), with Pi/K by DLMF 19.8.6.
 """
 
 import math
@@ -50,11 +50,12 @@ def as_components(values) -> tuple[Scalars, ...]:
 
 
 class Roles(NamedTuple):
-    """One body, its axes renumbered: the momentum circles axis 3, axis 2 is the intermediate one.
+    """Renumbered axes of a body: the momentum circulates about axis 3, and axis 2 is intermediate.
 
-    Rates are divided by a power of two near the largest, moments by one that leaves the largest
-    momentum near one, so that no product of momenta leaves the range of the dtype; time is to be
-    multiplied by ``rate_unit``, which is zero for a body at rest (its direction is then a dummy).
+    Rates are divided by a power of two close to the largest rate, and moments by one for which the
+    largest momentum is close to one, so that products of momenta do not overflow or underflow. The
+    scaled time is the time times ``rate_unit``, which is zero for a body at rest (its rates are
+    then arbitrary).
     """
 
     moments: Triple
@@ -64,18 +65,18 @@ class Roles(NamedTuple):
     gap: Scalars  # |I3 w3^2 (I3 - I2) - I1 w1^2 (I2 - I1)|, the distance from the separatrix
     sense: Scalars  # +1 when axis 3 has the largest moment, -1 when the smallest
     parity: Scalars  # +1 when axes 1, 2, 3 are a right-handed system
-    axis_2: Scalars  # where axis 2 stands among x, y, z: 0, 1 or 2
-    axis_3: Scalars  # where axis 3 stands
-    one: Scalars
+    axis_2: Scalars  # index of axis 2 among x, y, z: 0, 1 or 2
+    axis_3: Scalars  # index of axis 3
+    one: Scalars  # ones for ``staged``
 
 
 def component_at(values: Triple, index) -> Scalars:
-    """The value that stands at an index 0, 1 or 2."""
+    """The value at an index 0, 1 or 2."""
     return jnp.where(index == 0, values[0], jnp.where(index == 1, values[1], values[2]))
 
 
 def _extremes(x: Scalars, y: Scalars, z: Scalars) -> tuple[Int[Array, "*b"], Int[Array, "*b"]]:
-    """Where the smallest and the largest of three values stand; never the same place."""
+    """Indices of the smallest and the largest of three values; different even if all are equal."""
     low = jnp.where(y < x, jnp.where(z < y, 2, 1), jnp.where(z < x, 2, 0))
     high = jnp.where(y >= x, jnp.where(z >= y, 2, 1), jnp.where(z >= x, 2, 0))
     return low, high
@@ -87,13 +88,13 @@ def _energy_term(moment: Scalars, rate: Scalars, larger: Scalars, smaller: Scala
 
 
 def assign_roles(moments: Triple, rates: Triple) -> Roles:
-    """Sort the axes, choose the one that the momentum circles, scale by powers of two."""
+    """Sort the axes, choose the one about which the momentum circulates, scale by powers of two."""
     largest = jnp.maximum(jnp.maximum(jnp.abs(rates[0]), jnp.abs(rates[1])), jnp.abs(rates[2]))
     rate_unit = binade(largest)
     moment_unit = binade(jnp.maximum(jnp.maximum(moments[0], moments[1]), moments[2]))
     one = opaque_ones(moments[0])
-    # The momentum of a sphere circles no axis: the one that it is nearest to, so that it is not
-    # across it.
+    # The momentum of a sphere circulates about no axis. The axis closest to it is chosen, so that
+    # the momentum is not perpendicular to axis 3.
     sphere = (moments[0] == moments[1]) & (moments[1] == moments[2])
     order = tuple(jnp.where(sphere, jnp.abs(w), i) for w, i in zip(rates, moments, strict=True))
     k_low, k_high = _extremes(*order)
@@ -107,13 +108,14 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     )
     moment_unit = moment_unit * momentum_unit
     low, mid, high = low / momentum_unit, mid / momentum_unit, high / momentum_unit
-    # Exact next to the separatrix, where the two terms cancel and all depends on the difference.
+    # Accurate close to the separatrix, where the terms cancel and the motion depends on the
+    # difference.
     gap = subtract_pairs(
         _energy_term(high, w_high, high, mid), _energy_term(low, w_low, mid, low)
     ).value
     gap = staged(gap, one)
-    # A tie is the separatrix, or a spin about an axis across that of a symmetric body: there the
-    # circled axis must be one of the two equal ones.
+    # A gap of zero is the separatrix, or a rotation about a transverse axis of a symmetric body; in
+    # the latter case axis 3 must be one of the two equal ones.
     larger = (gap > 0) | ((gap == 0) & (high - mid <= mid - low))
     sense = staged(jnp.where(larger, 1, -1).astype(low.dtype), one)
     larger = sense > 0
@@ -134,20 +136,20 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
 
 
 def restore(values: Triple, axis_2: Scalars, axis_3: Scalars) -> Triple:
-    """Values along axes 1, 2, 3 put back along x, y, z."""
+    """Values along axes 1, 2, 3 in the order of x, y, z."""
     first, second, third = values
     return triple(
         jnp.where(axis_3 == k, third, jnp.where(axis_2 == k, second, first)) for k in range(3)
     )
 
 
-# Beyond this parameter m the series in the nome are replaced by those in the complementary nome;
-# on either side three terms (five in the half nome of the attitude) reach the last bit of a double.
+# Beyond this parameter m the series in the nome are replaced by those in the complementary nome.
+# On either side three terms (five in the half nome of the attitude) are accurate to float64.
 _CIRCULAR_BELOW = 0.8
 
 
 class Polhode(NamedTuple):
-    """Constants of the momentum's motion in the body (axes in their roles, scaled units)."""
+    """Constants of the motion of the momentum in the body, along axes 1, 2, 3, in scaled units."""
 
     momentum: Triple
     inverse_moments: Triple
@@ -159,7 +161,7 @@ class Polhode(NamedTuple):
     B: Scalars  # |L^2/I1 - 2E|
     m: Scalars
     m1: Scalars
-    circular: Bool[Array, "*b"]  # series in sines (else hyperbolic, near the separatrix)
+    circular: Bool[Array, "*b"]  # series in sines; else in hyperbolic sines, near the separatrix
     on_separatrix: Bool[Array, "*b"]  # infinite period
     permanent: Bool[Array, "*b"]  # permanent rotation about a principal axis
     nome: Scalars
@@ -176,7 +178,7 @@ class Polhode(NamedTuple):
     axis_2: Scalars
     axis_3: Scalars
     one: Scalars
-    half_turn_rate_low: Scalars | None = None  # rounding error of the rate, where compensated
+    half_turn_rate_low: Scalars | None = None  # rounding error of the rate, if compensated
 
 
 class Precession(NamedTuple):
@@ -189,15 +191,15 @@ class Precession(NamedTuple):
     length: Scalars  # |L|
     L3_max: Scalars  # largest L3
     addition_coefficient: Scalars  # sigma p a^2 / (|L| (|L| + c) c) of (12)
-    start: tuple[Scalars, Scalars, Scalars, Scalars]  # initial attitude, less its tilt
+    start: tuple[Scalars, Scalars, Scalars, Scalars]  # initial attitude without its tilt
     half_turn_rate_low: Scalars | None = None
 
 
 class FreeConstants(NamedTuple):
     """Per-body constants of the exact free motion; every field has the shape of the batch.
 
-    ``moments``, ``products``, ``omega`` and ``wxyz`` are the input, through which alone
-    derivatives flow; ``polhode`` and ``precession`` are computed from them.
+    ``moments``, ``products``, ``omega`` and ``wxyz`` are the input, and the only fields that are
+    differentiated; ``polhode`` and ``precession`` are computed from them.
     """
 
     moments: Triple
@@ -295,7 +297,8 @@ def descend(polhode: Polhode, length: Scalars) -> Scalars:
 
 
 def _circular_series(polhode: Polhode, shift: Scalars):
-    """(10): theta_4(v + i b | q^2) in powers of sin(v)^2, and the slope of its argument at 0."""
+    """(10): theta_4(v + i b | q^2) in powers of sin(v)^2, and the derivative of its phase at
+    v = 0."""
     q = polhode.nome * polhode.nome
     q2 = q * q
     even = q * (1 + 2 * shift * shift)  # q cosh 2b
@@ -363,7 +366,8 @@ def _hyperbolic_series(polhode: Polhode, tangent: Scalars):
 
 
 def precession_constants(polhode: Polhode, wxyz: tuple[Scalars, ...]) -> Precession:
-    """(10)-(12): mean rate of the angle about L, its theta series, and the untilted start."""
+    """(10)-(12): mean rate of the angle about L, its theta series, and the initial attitude without
+    its tilt."""
     l1, l2, l3 = polhode.momentum
     d1, _, d3 = polhode.inverse_moments
     length = jnp.sqrt(l1 * l1 + l2 * l2 + l3 * l3)
@@ -388,7 +392,8 @@ def precession_constants(polhode: Polhode, wxyz: tuple[Scalars, ...]) -> Precess
     beta = jnp.where(no_shift, 0, polhode.sense * 2 * shift_angle)
     beta, slope = staged((beta, slope), polhode.one)
     half_rate = start_rate + polhode.rate * (polhode.sense * slope - beta / polhode.log_nome)
-    # The minimal rotation carrying L to axis 3 is (|L| + |L3|, L x n3); the start undoes it.
+    # The minimal rotation that carries L to axis 3 is (|L| + |L3|, L x n3); ``start`` is without
+    # it.
     side = polhode.parity * jnp.copysign(1, l3)
     tilt = restore((side * l2, -side * l1, jnp.zeros_like(l3)), polhode.axis_2, polhode.axis_3)
     w = length + jnp.abs(l3)
@@ -429,7 +434,7 @@ def motion_constants(
     return polhode, None if wxyz is None else precession_constants(polhode, wxyz)
 
 
-# Enough for 1 - m down to 1e-20 and moments that differ by a millionth: then one more bit each.
+# Sufficient for 1 - m down to 1e-20 and for moments that differ by a millionth.
 _AGM_STEPS = 8
 _INVERSE_PI = 0.3183098861837907, -1.9678676675182486e-17
 
@@ -448,7 +453,8 @@ def _halved(x: Pair) -> Pair:
 
 
 def _means(complement: Pair, pole: Pair) -> tuple[Pair, Pair, Scalars]:
-    """agm(1, complement), the sum of Q (DLMF 19.8.6; ``pole``: root of 1 - n), the last step."""
+    """agm(1, complement), the sum of the Q of DLMF 19.8.6, and the size of the last step; ``pole``:
+    the square root of 1 - n."""
     one = Pair(jnp.ones_like(pole.high), jnp.zeros_like(pole.high))
 
     def step(_, state):
@@ -461,7 +467,7 @@ def _means(complement: Pair, pole: Pair) -> tuple[Pair, Pair, Scalars]:
         p = _halved(divide_pairs(total, p))
         return _halved(add_pairs(a, b)), root_of(product), p, weight, add_pairs(pi_sum, weight)
 
-    # A loop and not an unrolled formula: it compiles in a tenth of the time.
+    # As a loop it compiles in a tenth of the time of an unrolled formula.
     a, b, _, weight, pi_sum = jax.lax.fori_loop(
         0, _AGM_STEPS, step, (one, complement, pole, one, one)
     )
@@ -471,8 +477,8 @@ def _means(complement: Pair, pole: Pair) -> tuple[Pair, Pair, Scalars]:
 def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
     """Half-turn rates of ``Polhode`` and ``Precession`` per scaled time, and size of the last step.
 
-    Of the two characteristics -p/r and that of DLMF 19.7.9 the one near zero is taken: with the
-    latter Pi stands for the angle counted with the momentum's own turns in the body.
+    Pi is computed for the characteristic -p/r or that of DLMF 19.7.9, whichever is closer to zero.
+    With the latter the angle includes the rotations of the momentum in the body.
     """
     i1, i2, i3 = roles.moments
     d12, d23, d13 = (_absolute(sum_of(a, -b)) for a, b in ((i2, i1), (i3, i2), (i3, i1)))
@@ -496,7 +502,8 @@ def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
     half_turn_rate = multiply_pairs(
         multiply_pairs(root_of(divide_pairs(square, volume)), mean), inverse_pi
     )
-    # |L|/I1 (1 -+ (I2 - I1) total / (2 I2)) less a turn per period, or |L|/I3 +- A total / (2 |L|).
+    # |L|/I1 (1 -+ (I2 - I1) total / (2 I2)) minus one rotation per period, or
+    # |L|/I3 +- A total / (2 |L|).
     parts = _where(near_zero, multiply_pairs(length, d12), divide_pairs(B, length))
     pi_part = multiply_pairs(_halved(parts), pi_sum)
     span = scale_pair(
@@ -516,14 +523,14 @@ def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
 def compensated_constants(
     moments: Triple, omega: Triple, wxyz: tuple[Scalars, ...] | None
 ) -> tuple[Polhode, Precession | None]:
-    """All constants, with the rounding errors of both rates beside them."""
+    """All constants, with the rounding errors of both rates."""
     if omega[0].dtype == jnp.float32:
         return in_double(_rounded_constants, moments, omega, wxyz)
     roles = assign_roles(moments, omega)
     polhode = polhode_constants(roles)
-    # Staged: the two parts of a pair must come out of one and the same sum.
+    # Staged, because both parts of a pair must be results of the same evaluation.
     half_turn_rate, angle, last_step = staged(compensated_rates(roles), roles.one)
-    # Convergence is quadratic: what is left is the square of the last step.
+    # Convergence is quadratic: the remaining error is the square of the last step.
     converged = (last_step < jnp.finfo(last_step.dtype).eps / 64) & ~polhode.on_separatrix
     precession = None if wxyz is None else precession_constants(polhode, wxyz)
     polhode = _with_rate(polhode, half_turn_rate, converged, roles.rate_unit)
@@ -538,7 +545,7 @@ _Motion = TypeVar("_Motion", Polhode, Precession)
 def _with_rate(
     motion: _Motion, compensated: Pair, converged: Bool[Array, "*b"], rate_unit: Scalars
 ) -> _Motion:
-    """With the pair in place of the plain rate, unless it is NaN or disagrees with it."""
+    """With the pair instead of the plain rate, unless it has not converged or disagrees with it."""
     rate, high, low = motion.half_turn_rate, *(x * rate_unit for x in compensated)
     converged = converged & (jnp.abs(high - rate) <= 2.0**-30 * jnp.abs(rate))
     return motion._replace(
@@ -548,16 +555,16 @@ def _with_rate(
 
 
 def _rounded_constants(moments, omega, wxyz) -> tuple[Polhode, Precession | None]:
-    """Constants of numbers in double precision, rounded to single.
+    """Constants computed in double precision, rounded to single precision.
 
-    Sums of two floats of single precision took three times as long to compile and were less
-    accurate.
+    Sums of two single-precision floats take 2.4 times as long to compile, and their error is 1.2
+    times as large (docs/design_notes.md).
     """
     polhode, precession = motion_constants(moments, omega, wxyz)
 
     def rounded(motion):
         rate = motion.half_turn_rate
-        # Not by a conversion there and back: XLA removes the pair on a GPU, and low becomes zero.
+        # Not by conversion to float32 and back: on a GPU XLA removes both, and low becomes zero.
         low = rate - jax.lax.reduce_precision(rate, exponent_bits=8, mantissa_bits=23)
         return _cast(motion._replace(half_turn_rate_low=low), jnp.float32)
 
@@ -565,7 +572,7 @@ def _rounded_constants(moments, omega, wxyz) -> tuple[Polhode, Precession | None
 
 
 def _cast(tree: Any, dtype) -> Any:
-    """The floats of a tree in another precision."""
+    """The tree with its floats in another precision."""
     return jax.tree.map(
         lambda x: (
             jax.lax.convert_element_type(x, dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x

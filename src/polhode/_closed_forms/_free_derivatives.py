@@ -1,9 +1,9 @@
-"""The derivative of the exact free motion as a rule of JAX, which can itself be differentiated.
+"""The derivative of the exact free motion as a JAX rule, which can itself be differentiated.
 
-The constants of the motion are computed by formulas made for rounding, with branches and quotients
-of differences, whose chain rule is 0/0 in a symmetric body and on the separatrix. The tangent
-(``_free_tangent``) uses their values alone. For second derivatives each value is given the
-derivative of a plain formula, which is regular everywhere; nothing of it is evaluated unless the
+The formulas of the constants minimise rounding. They have branches and quotients of differences,
+whose derivatives by the chain rule are 0/0 for a symmetric body and on the separatrix. The tangent
+(``_free_tangent``) therefore uses only the values of the constants. For second derivatives, each
+value gets the derivative of a plain formula, which is regular everywhere and evaluated only if the
 tangent is differentiated again.
 """
 
@@ -43,7 +43,7 @@ Scalars = Float[Array, "*b"]
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def with_formula_derivative(formula, value, constants, arguments):
-    """``value``, with the derivative of ``formula(fixed, given)`` with respect to ``given``."""
+    """``value``, with the derivative of ``formula(constants, arguments)`` by ``arguments``."""
     return value
 
 
@@ -55,9 +55,10 @@ def _with_formula_derivative_rule(formula, primals, tangents):
 
 
 def _start_formula(polhode: Polhode, arguments):
-    """Plain formulas of the constants in ``start_of``."""
-    # Plain: differences of moments and momenta, no branch. Their values would lose digits near
-    # symmetric bodies, which is why `start_of` has others; their derivatives are exact everywhere.
+    """Plain formulas of the constants in ``with_start_derivative``."""
+    # Differences of moments and momenta, without branches. Their values lose digits for nearly
+    # symmetric bodies, which is why `polhode_constants` has other formulas; their derivatives are
+    # accurate everywhere.
     frame = Frame(polhode)
     moments, omega = arguments
     rate_unit = jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
@@ -72,7 +73,7 @@ def _start_formula(polhode: Polhode, arguments):
 
 
 def with_start_derivative(polhode: Polhode, moments: Triple, omega: Triple) -> Polhode:
-    """The constants that stand in the tangent, with derivatives by moments and initial rates."""
+    """The constants with derivatives by moments and initial rates, as the tangent needs them."""
     value = polhode.momentum, polhode.inverse_moments, polhode.moments
     value = (*value, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
     momentum, inverse_moments, moments, p, r, s, A, B = with_formula_derivative(
@@ -89,7 +90,7 @@ def _momentum_formula(polhode: Polhode, arguments):
 
 
 def with_momentum_derivative(polhode: Polhode, functions: Triple, momentum_at_t: Triple) -> Triple:
-    """The momentum at time t, with its derivative by the start and by S, C, N."""
+    """The momentum at time t, with derivatives by the initial momentum and by S, C, N."""
     arguments = (polhode.momentum, polhode.p, polhode.r, polhode.s, functions)
     return with_formula_derivative(_momentum_formula, momentum_at_t, polhode, arguments)
 
@@ -100,7 +101,7 @@ def _difference_formula(_, arguments):
 
 
 def with_difference_derivative(polhode: Polhode, x: Scalars, y: Scalars) -> Scalars:
-    """B r - A p, exact where it vanishes on the separatrix."""
+    """x - y = B r - A p, accurate where it vanishes, on the separatrix."""
     return with_formula_derivative(_difference_formula, polhode.m1 * x, (), (x, y))
 
 
@@ -117,9 +118,9 @@ def _quarter_formula(circular, on_separatrix, x: Scalars, z: Scalars):
 def with_functions_derivative(
     has_time_axis: bool, value, constants, x: Scalars, z: Scalars, t: Scalars
 ):
-    """``value``: S, C, N and the integrals of S^2 and (S/N)^2; with their derivatives.
+    """``value``: S, C, N and the integrals of S^2 and (S/N)^2, with their derivatives.
 
-    ``constants``: those of the polhode and its half turns so far; ``x`` = B r, ``z`` = B r - A p.
+    ``constants``: the ``Polhode`` and the number of half turns; ``x`` = B r, ``z`` = B r - A p.
     """
     return value
 
@@ -131,7 +132,7 @@ def _functions_rule(has_time_axis, primals, tangents):
     value = with_functions_derivative(has_time_axis, value, constants, x, z, t)
     polhode, half_turns = constants
     S, C, N, first, second = value
-    # y = A p has the derivative of x - z: z carries its own, exact where it vanishes (separatrix).
+    # y = A p has the derivative of x - z, in which that of z is accurate on the separatrix.
     # S' = C N, C' = -x S N, N' = -y S C in the time, and `partials` are those by the coefficients.
     y = with_formula_derivative(_difference_formula, polhode.A * polhode.p, (), (x, z))
     dS, dC, dN = partials(x, y, (S, C, N), first, second).along(dx, dz)
@@ -142,9 +143,9 @@ def _functions_rule(has_time_axis, primals, tangents):
         (sign * S, sign * C, N),
         (sign * dS, sign * dC, dN),
     )
-    # Integrals grow by those of a quarter of a turn, twice with each half turn. The incomplete part
-    # and the complete one have derivatives of their own; together they are smooth where the number
-    # of half turns changes.
+    # With each half turn the integrals grow by twice those over a quarter period. The incomplete
+    # and the complete parts are differentiated separately; their sum is smooth where the number of
+    # half turns changes.
     _, turn = jax.jvp(
         functools.partial(_quarter_formula, polhode.circular, polhode.on_separatrix),
         (x, z),
@@ -158,24 +159,25 @@ def _functions_rule(has_time_axis, primals, tangents):
 
 
 def _axes_turn(_, arguments) -> Triple:
-    """Turn of the principal axes that entries xy, xz, yz of the tensor make."""
+    """Rotation of the principal axes by small entries xy, xz, yz of the tensor."""
     (a, b, c), (xy, xz, yz) = arguments
     return over_gap(yz, b, c), over_gap(xz, c, a), over_gap(xy, a, b)
 
 
 def along_turning_axes(arguments, dm, dp, dw):
-    """Everything along principal axes that turn with the tensor, and the way back of a vector.
+    """Arguments and tangents along principal axes that rotate with the tensor, and the function
+    that transforms a vector back to the body axes.
 
-    The products of inertia are zero and only carry a tangent, so that the turn is zero as well: it
-    counts in second derivatives alone. Axes of equal moments have no such turn, and second
-    derivatives by the product between them are NaN.
+    The products of inertia are zero and have tangents only, so that the rotation is zero as well:
+    it contributes to second derivatives only. It is not defined for axes of equal moments, and
+    second derivatives by the product between them are NaN.
     """
     moments, products, omega, wxyz, t = arguments
     none = tuple(jnp.zeros_like(x) for x in products)
     turn = with_formula_derivative(_axes_turn, none, (), (moments, products))
 
-    # Axes along which the products stay zero turn with the tensor. What is differentiated then
-    # depends on moments alone, as the closed form does, and the vectors are turned back.
+    # In axes that rotate with the tensor, its products remain zero. The differentiated functions
+    # then depend on moments only, as the closed form does, and vectors are transformed back.
     def along(v):
         return None if v is None else tuple(a - b for a, b in zip(v, cross(turn, v), strict=True))
 
@@ -186,7 +188,7 @@ def along_turning_axes(arguments, dm, dp, dw):
         a, b, c = none if dm is None else dm
         xy, xz, yz = none if dp is None else dp
         x, y, z = turn
-        # M K - K M for the turn's cross product K.
+        # M K - K M, where K is the cross-product matrix of the rotation
         dm = (a + 2 * (xy * z - xz * y), b + 2 * (yz * x - xy * z), c + 2 * (xz * y - yz * x))
         dp = (
             xy + (b - a) * z + xz * x - yz * y,
@@ -222,7 +224,7 @@ def variation_at_rest(at_rest, arguments, dw, dt) -> tuple[Triple, Triple]:
 
 
 class EvaluatedMotion(NamedTuple):
-    """The motion at time t and the constants it came from: values without derivatives."""
+    """The motion at time t and its constants: values without derivatives."""
 
     polhode: Polhode
     precession: Precession | None
@@ -231,7 +233,7 @@ class EvaluatedMotion(NamedTuple):
 
 
 def dense_or_none(tangents, primals):
-    """None where every tangent is zero, arrays otherwise."""
+    """None if every tangent is a symbolic zero; otherwise arrays."""
     if tangents is None or all(isinstance(x, SymbolicZero) for x in jax.tree.leaves(tangents)):
         return None
     return jax.tree.map(
@@ -240,7 +242,8 @@ def dense_or_none(tangents, primals):
 
 
 def start_variation(polhode: Polhode, frame: Frame, dm, dp, dw) -> Variation:
-    """Variation of the initial momentum and of the inverse tensor, in roles and scaled units."""
+    """Variation of the initial momentum and of the inverse tensor, along axes 1, 2, 3, in scaled
+    units."""
     zero = (jnp.zeros_like(polhode.moment_unit),) * 3
     inverse_rate_unit = 1 / jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
     di = tuple(x / polhode.moment_unit for x in frame.to_roles(dm)) if dm is not None else zero
@@ -267,7 +270,8 @@ def start_variation(polhode: Polhode, frame: Frame, dm, dp, dw) -> Variation:
 def _relative_turn(
     polhode: Polhode, precession: Precession, frame: Frame, at: Instant, momentum_step: Triple
 ):
-    """Quaternion from the attitude at t to that at the start, its vector part exact when small."""
+    """Quaternion from the attitude at t to that at the start, whose vector part is accurate if it
+    is small."""
     l1, l2, l3 = frame.reflected(polhode.momentum)
     s1, s2, s3 = frame.reflected(momentum_step)
     c, s = at.precession_half_angle
@@ -299,10 +303,11 @@ def _turn_tangent(
     t,
 ):
     """Variation of the attitude: a rotation vector along axes 1, 2, 3 at time t."""
-    # Across L it follows from the conservation of L in space: the direction of L seen from the body
-    # must move as the momentum in the body does (`momentum_lag`). About L it is the variation of
-    # the energy times t and one integral along the motion, of L L with the variation of the inverse
-    # tensor: the precession angle itself, an integral of the third kind, is not differentiated.
+    # The part perpendicular to L follows from the conservation of L in space: the direction of L in
+    # body axes must change as the momentum in the body does (`momentum_lag`). The part along L is
+    # the variation of the energy times t, plus an integral along the motion of L L^T contracted
+    # with the variation of the inverse tensor. Thus the precession angle, an integral of the third
+    # kind, is not differentiated.
     sigma_pi = polhode.sense * polhode.parity
     invariants = Invariants(polhode.momentum, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
     scalar, vector = relative
@@ -332,10 +337,10 @@ def _turn_tangent(
 
 
 def _regularised(polhode: Polhode, at: Instant, t: Scalars) -> Instant:
-    """S, C, N as the tangent needs them; the momentum itself does not.
+    """The motion with regular S, C, N for the tangent; the momentum does not need them.
 
-    Where omega_p is zero S is the time. On the separatrix derivatives grow without bound: they are
-    held where their products would overflow.
+    If omega_p is zero, S is the time. On the separatrix derivatives grow without bound: C and N are
+    limited from below, so that products do not overflow.
     """
     is_still = polhode.inverse_rate == 0
     smallest = 2.0 ** -{4: 17, 8: 140}[t.dtype.itemsize]
@@ -355,9 +360,8 @@ def _staged(ones, values):
 
 
 class _Tangent(NamedTuple):
-    """Variations of L and of the attitude at time t, along axes 1, 2, 3 in scaled units.
-
-    The contribution of a variation of t itself is left out.
+    """Variations of L and of the attitude at time t, along axes 1, 2, 3, in scaled units, without
+    the contribution of a variation of t.
     """
 
     polhode: Polhode
@@ -371,11 +375,11 @@ class _Tangent(NamedTuple):
 def _tangent(
     has_time_axis: bool, attitude: bool, motion: EvaluatedMotion, arguments, dm, dp, dw
 ) -> _Tangent:
-    """The formulas of _free_tangent.py, every value in them with a derivative of its own."""
+    """The formulas of ``_free_tangent``, in which every value has a derivative rule."""
     moments, _, omega, _, t = arguments
     scaled_time = t * motion.polhode.rate_unit
     ones = opaque_ones(scaled_time), motion.polhode.one
-    # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
+    # The transpose of a stage is a stage, so that sums of cotangents are not repeated either.
     stage = functools.partial(_staged, ones)
     polhode = with_start_derivative(motion.polhode, moments, omega)
     frame = Frame(polhode)
@@ -417,9 +421,8 @@ def _tangent(
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _relative(has_time_axis: bool, motion: EvaluatedMotion, arguments):
-    """Turn from the start to time t, of which the tangent of the attitude is made, as quaternion.
-
-    Right-handed axes 1, 2, 3; its derivative is the tangent of the attitude itself.
+    """Quaternion of the rotation between the start and time t, which the tangent of the attitude
+    contains, along right-handed axes 1, 2, 3. Its derivative follows from that tangent.
     """
     polhode, at = motion.polhode, motion.at
     sigma_pi = polhode.sense * polhode.parity
@@ -521,12 +524,12 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
         d_wxyz = quaternion_product(results[1], (jnp.zeros_like(n1), *(x / 2 for x in turn)))
         if dq is not None:
             d_wxyz = _start_tangent(start, dq, results[1], d_wxyz)
-    # or what puts the components together would compute all of them for each entry
+    # staged: otherwise XLA computes all components again for each entry of the stacked result
     return staged((d_omega, d_wxyz), opaque_ones(motion.polhode.rate_unit * arguments[4]))
 
 
 def _start_tangent(start: Quadruple, variation: Quadruple, attitude: Quadruple, tangent: Quadruple):
-    """Adds the variation that comes from the initial attitude, which is normalised before use."""
+    """Add the variation due to the initial attitude, which is normalised before use."""
     inverse_square = 1 / dot(start, start)
     along = dot(start, variation)
     unit = tuple(

@@ -36,7 +36,8 @@ def _phase(motion: Polhode | Precession, t: Scalars) -> tuple[Scalars, Scalars]:
 def half_turns_at(polhode: Polhode, t: Scalars) -> tuple[Scalars, Scalars]:
     """Half turns of the theta functions' argument: a whole number and the remainder."""
     half_turns, fraction = _phase(polhode, t)
-    # Farther out the momentum has reached the middle axis and nothing but overflow would follow.
+    # On the separatrix the argument is limited: beyond, the momentum is along the intermediate axis
+    # to rounding, and the exponentials would overflow.
     limit = math.log(2) * {4: 55, 8: 450}[fraction.dtype.itemsize]
     fraction = jnp.where(
         polhode.on_separatrix, jnp.clip(polhode.half_turn_rate * t, -limit, limit), fraction
@@ -91,7 +92,7 @@ def momentum_of(polhode: Polhode, functions: Triple) -> Triple:
 
 
 def momentum(polhode: Polhode, functions: Triple) -> Triple:
-    """The same; a permanent rotation about a principal axis keeps its rates to the last bit."""
+    """The same; the momentum of a permanent rotation about a principal axis is exactly constant."""
     momentum_at_t = momentum_of(polhode, functions)
     return triple(
         jnp.where(polhode.permanent, l, x)
@@ -100,17 +101,17 @@ def momentum(polhode: Polhode, functions: Triple) -> Triple:
 
 
 class Instant(NamedTuple):
-    """The motion at one time, axes in their roles, scaled units."""
+    """The motion at one time, along axes 1, 2, 3, in scaled units (see ``Roles``)."""
 
     half_turns: Scalars  # half turns of the theta functions' argument
-    reduced: Triple  # S, C, N less their half turns
+    reduced: Triple  # S, C, N since the last half turn
     functions: Triple  # S = sn / omega_p, C = cn, N = dn
     momentum: Triple
-    half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, over |M|
+    half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, scaled
 
     @property
     def precession_half_angle(self) -> tuple[Scalars, Scalars]:
-        """``half``; ValueError where ``advance`` had no ``Precession``."""
+        """``half``; ValueError if ``advance`` had no ``Precession``."""
         if self.half is None:
             raise ValueError("the motion was evaluated for its rates alone: pass a Precession.")
         return self.half
@@ -119,7 +120,7 @@ class Instant(NamedTuple):
 def half_angle(
     polhode: Polhode, precession: Precession, t: Scalars, fraction, half, N, factors: Triple, stage
 ):
-    """(10)-(12): cosine and sine of half of the angle about L, over the length of the tilt."""
+    """(10)-(12): cosine and sine of half of the angle about L, without normalisation."""
     S, l2, l3 = factors
     half_turns, angle = _phase(precession, t)
     angle = angle + precession.beta * fraction
@@ -138,7 +139,7 @@ def half_angle(
     theta_real, theta_imaginary = stage((theta_real, theta_imaginary))
     mu = precession.L3_max / precession.length
     y, w = jnp.abs(polhode.momentum[2]) / precession.L3_max, jnp.abs(l3) / precession.L3_max
-    # (12): the series hold for the motion that starts where L3 is largest.
+    # (12): the series are those of the motion that starts where L3 is largest.
     a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)
     b = precession.addition_coefficient * S * polhode.momentum[1] * l2
     # (cosine + i sine) (real - i imaginary) (a + i b): angles are added as products of complex
@@ -150,9 +151,8 @@ def half_angle(
 def advance(polhode: Polhode, precession: Precession | None, t: Scalars, fine: bool = False):
     """The ``Instant`` of time t.
 
-    Computed in stages (see ``staged``): without them the loop over each component of the result
-    repeats all arithmetic, and is compiled with it. ``fine``: in more stages, for results that many
-    kernels need.
+    It is computed in stages (see ``staged``): without them XLA repeats all arithmetic in the loop
+    over each component of the result. ``fine``: more stages, for results that many loops use.
     """
     one = opaque_ones(t * polhode.one)
 
@@ -184,7 +184,8 @@ def body_rates(polhode: Polhode, at: Instant) -> Triple:
 
 
 def attitude_at(polhode: Polhode, precession: Precession, at: Instant) -> tuple[Scalars, ...]:
-    """Attitude: the start, the turn about axis 3, and the minimal rotation carrying L to it."""
+    """Attitude: the initial one without its tilt, the rotation about axis 3, and the minimal
+    rotation that carries L to it."""
     l1, l2, l3 = at.momentum
     c, s = at.precession_half_angle
     height = precession.length + jnp.abs(l3)

@@ -67,7 +67,8 @@ class Periods(NamedTuple):
     k2: Scalars
     """Elliptic parameter, 0 for a symmetric body and 1 on the separatrix."""
     theta_min: Scalars
-    """Least angle between long axis and momentum [rad]; in LAM that to the nearer of its ends."""
+    """Smallest angle between long axis and momentum [rad]; in LAM from the closer end of the
+    axis."""
     theta_max: Scalars
 
     @property
@@ -84,8 +85,9 @@ class Periods(NamedTuple):
 def principal_periods(moments, omega, products=None) -> Periods:
     """Periods of bodies of principal ``moments`` (..., 3) and body rates ``omega`` (..., 3).
 
-    Infinite where there is no such motion: P_psi on the separatrix, for a sphere and for a
-    symmetric body that spins across its axis, both for a body at rest (nutation limits: 0, pi).
+    Periods are infinite if there is no such motion: P_psi on the separatrix, for a sphere and for a
+    symmetric body that rotates about a transverse axis; both for a body at rest (with nutation
+    limits 0 and pi).
     ``products`` as in `prepare`. Formulas: Landau & Lifshitz, Mechanics, section 37, in the L
     convention of Samarasinha & A'Hearn, Icarus 93 (1991).
     """
@@ -97,10 +99,10 @@ def principal_periods(moments, omega, products=None) -> Periods:
 
 
 def _mean_precession(polhode: Polhode, precession, rate_unit: Scalars) -> Scalars:
-    """Mean rate about L of the long axis, scaled time."""
+    """Mean rate of the long axis about L, in scaled time."""
     half_turns = math.pi * polhode.half_turn_rate / rate_unit
     about_L = 2 * math.pi * precession.half_turn_rate / rate_unit
-    # The long axis takes one turn less per period than the minimal rotation; for needles that
+    # The long axis makes one revolution less per period than the minimal rotation. For needles this
     # difference cancels, and the theta series of the axis itself is used instead.
     shift = descend(polhode, precession.length)
     growth = jnp.where(polhode.circular, shift + jnp.sqrt(1 + shift * shift), 1)
@@ -182,7 +184,7 @@ def _periods(arguments):
 def _periods_rule(primals, tangents):
     arguments = primals[0]
     dm, dp, dw = (dense_or_none(d, x) for d, x in zip(tangents[0], arguments, strict=True))
-    # Of symmetric bodies the constants below have no right derivatives.
+    # For symmetric bodies the derivatives of the constants below are not valid: they become NaN.
     a, b, c = arguments[0]
     symmetric = are_close(a, b) | are_close(b, c) | are_close(c, a)
     arguments = jax.tree.map(functools.partial(underivable, where=symmetric), arguments)
@@ -209,7 +211,7 @@ def _periods_rule(primals, tangents):
     quarter = P_psi * polhode.rate_unit / 4
     quarter = jnp.where(permanent, 1, quarter)
     divisor = jnp.where(x > 0, x, 1)
-    # By dx and dz = dx - dy, which alone counts next to the separatrix.
+    # By dx and dz = dx - dy, which dominates close to the separatrix.
     relative = dx / divisor
     dquarter = (second * (polhode.m1 * dx - dz) - quarter * relative) / 2
     period = 4 * quarter
@@ -222,13 +224,13 @@ def _periods_rule(primals, tangents):
         start[2] ** 2 * period + polhode.p / s_divisor * difference,
     )
     at_rest, is_sphere = polhode.rate_unit == 0, polhode.s == 0
-    # finite in the branches that are not used: in reverse mode zero times infinity is NaN
+    # finite in branches that are not selected: in reverse mode zero times infinity is NaN
     length = jnp.where(at_rest, 1, precession.length)
     dangle = period * energy + dot(variation.inverse_moments, squares) / 2
     dangle = (dangle + dot(spin, start) * 4 * dquarter) / length
     rate_unit = jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
     rate = about / rate_unit  # scaled
-    # A permanent rotation about L: the rate is twice the energy over |L|.
+    # The rate of a permanent rotation about L is twice the energy over |L|.
     dlength = dot(start, variation.momentum) / length
     drate = jnp.where(
         permanent,
@@ -236,7 +238,7 @@ def _periods_rule(primals, tangents):
         (dangle - rate * 4 * dquarter) / period,
     )
     is_moving = about > 0
-    # zero, but NaN once derived by what has no right derivatives
+    # zero, with the NaN derivatives of symmetric bodies
     unmoved = 0 * energy
     dP_psi = jnp.where(permanent, unmoved, 4 * dquarter / rate_unit)
     log_derivative = drate / jnp.where(is_moving, rate, 1)
@@ -244,7 +246,7 @@ def _periods_rule(primals, tangents):
     dm1 = jnp.where(x > 0, (dz - polhode.m1 * dx) / divisor, unmoved)
     dk2 = jnp.where(x > 0, (dy - k2 * dx) / divisor, unmoved)
     dm1, dk2 = jnp.where(polhode.circular, -dk2, dm1), jnp.where(polhode.circular, dk2, -dm1)
-    # of a sphere, and at rest, the limits are constants; their formula is 0/0
+    # the limits of a sphere and of a body at rest are constants, and their formula is 0/0
     is_fixed = at_rest | is_sphere
     amplitudes = polhode.A, polhode.B, polhode.r, polhode.s, polhode.m1
     angles = jax.jvp(
@@ -266,8 +268,8 @@ def periods(inertia: Inertia, state: State) -> Periods:
     ``P_psi``: rotation about (LAM) or oscillation about (SAM) the long axis; ``P_phi``: mean
     precession of the long axis about the angular momentum; ``mode``: ``ph.Mode``; ``k2``: the
     elliptic parameter; ``theta_min``, ``theta_max``: angle between long axis and momentum.
-    Infinite where there is no such motion. Differentiable. Formulas: Landau & Lifshitz, Mechanics,
-    section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
+    Periods are infinite if there is no such motion. Differentiable. Formulas: Landau & Lifshitz,
+    Mechanics, section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
 
     Raises TypeError for anything but a ``ph.Inertia`` and a ``ph.State`` of one dtype.
     """
@@ -296,5 +298,5 @@ def _spread(x, batch):
     return jnp.broadcast_to(x, (*batch, x.shape[-1]))
 
 
-# as a kernel it compiles in a fifth of the time
+# a kernel, because it compiles in a fifth of the time
 _compiled = jax.jit(kernel(principal_periods))

@@ -3,14 +3,15 @@
 
 The momentum is an algebraic function of its initial value and of S = sn/omega_p, C = cn, N = dn,
 which depend on x = B r and y = A p alone; their derivatives need the integrals of S^2 and
-(S/N)^2. Products of inertia turn the principal axes: the quotients by differences of inverse
-moments are carried out on paper, so that nothing is divided by a difference that may vanish.
+(S/N)^2. Products of inertia rotate the principal axes: the divisions by differences of inverse
+moments are carried out analytically, so that the code does not divide by differences that may
+vanish.
 
-The attitude follows from two conserved quantities. With e the variation of the attitude (a
-rotation vector in body axes), R e x L = delta(ell) - R delta L is known because ell = R L is
-constant, and e . L = t delta E + 1/2 delta D : integral of L L^T, because the rate of e . L is
-omega . delta L + L . delta D L, of which omega . delta L + 1/2 L . delta D L is the constant
-delta E (D: inverse inertia tensor, E: energy).
+The variation of the attitude follows from two conserved quantities. Let e be this variation (a
+rotation vector in body axes), D the inverse inertia tensor and E the energy. Its part perpendicular
+to L is given by R e x L = delta(ell) - R delta L, because ell = R L is constant. Its part along L
+is e . L = t delta E + 1/2 delta D : integral of L L^T, because the rate of e . L is
+omega . delta L + L . delta D L, where omega . delta L + 1/2 L . delta D L is the constant delta E.
 """
 
 import math
@@ -46,11 +47,11 @@ def incomplete(S: Scalars, C: Scalars, N: Scalars, has_time_axis: bool) -> tuple
         return first, second, (x + growth) / 4, (y + growth) / 4, (z + growth) / 4, weight / 4
 
     zero, one = jnp.zeros_like(N), jnp.ones_like(N)
-    # The first roots are known: C and N are smooth where the root of C^2 is not.
+    # The first roots are C and N themselves, which are smooth where the root of C^2 is not.
     carry = halve(zero, zero, C * C, N * N, one, jnp.ones((), N.dtype), C, N, one)
     if has_time_axis:
-        # With many times per body several kernels need the result, and each would repeat all of
-        # it: as a loop it is computed once, and compiles in half of the time.
+        # With many times per body several loops use the result, and XLA would repeat all of it in
+        # each. As a loop it is computed once, and compiles in half of the time.
         carry = jax.lax.fori_loop(1, _DUPLICATIONS, duplicate, carry)
     else:
         for k in range(1, _DUPLICATIONS):
@@ -73,7 +74,7 @@ def complete(polhode: Polhode) -> tuple[Scalars, Scalars]:
 
 
 def quarter_turn(circular, on_separatrix, m, m1, agm, log_nome, inverse_rate):
-    """The same from the parameter, its complement and what comes of their mean."""
+    """The same from the parameter, its complement and the results of ``agm_and_nome``."""
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
     per_square = nome_per_parameter(square, jnp.sqrt(other))
@@ -91,14 +92,16 @@ def quarter_turn(circular, on_separatrix, m, m1, agm, log_nome, inverse_rate):
 def second_kind(
     polhode: Polhode, half_turns: Scalars, reduced: Triple, has_time_axis: bool
 ) -> tuple[Scalars, Scalars]:
-    """Integrals of S^2 and (S/N)^2 from the start; ``reduced``: S, C, N less half turns."""
+    """Integrals of S^2 and (S/N)^2 from the start; ``reduced``: S, C, N since the last half
+    turn."""
     first, second = incomplete(*reduced, has_time_axis)
     turn_first, turn_second = complete(polhode)
     return first + 2 * half_turns * turn_first, second + 2 * half_turns * turn_second
 
 
 class Variation(NamedTuple):
-    """Variation of the start, axes in their roles, scaled units."""
+    """Variation of the initial momentum and the inverse tensor, along axes 1, 2, 3, in scaled
+    units."""
 
     momentum: Triple
     inverse_moments: Triple  # of the inverse moments
@@ -106,7 +109,7 @@ class Variation(NamedTuple):
 
 
 class Partials(NamedTuple):
-    """Derivatives of S, C, N with respect to x, at fixed z = x - y, and to z."""
+    """Derivatives of S, C, N with respect to x at constant z = x - y, and with respect to z."""
 
     S: tuple[Scalars, Scalars]
     C: tuple[Scalars, Scalars]
@@ -120,7 +123,7 @@ def partials(x: Scalars, y: Scalars, functions: Triple, first: Scalars, second: 
     """(15): derivatives of S, C, N from the integrals of S^2 and (S/N)^2."""
     S, C, N = functions
     square = S * S
-    # z is what vanishes on the separatrix, where ``second`` grows without bound.
+    # By z, because z vanishes on the separatrix, where ``second`` grows without bound.
     return Partials(
         ((C * N * first - square * S) / 2, C * N * second / 2),
         (-S * (S * C + x * N * first) / 2, -x * S * N * second / 2),
@@ -129,7 +132,7 @@ def partials(x: Scalars, y: Scalars, functions: Triple, first: Scalars, second: 
 
 
 class Invariants(NamedTuple):
-    """What the integrals of products of momenta depend on."""
+    """The quantities on which the integrals of products of momenta depend."""
 
     momentum: Triple
     p: Scalars
@@ -146,8 +149,8 @@ def _quotients(invariants: Invariants, functions: Triple):
     square = S * S
     tail = r * s * (l3 * l3) * square
     delta = C * C + tail
-    # (1 - C)/r = B S^2/(1 + C) because 1 - C^2 = B r S^2: no divisor vanishes for C >= 0. Where C
-    # is negative r cannot be zero, and the plain quotient loses nothing.
+    # (1 - C)/r = B S^2/(1 + C) because 1 - C^2 = B r S^2: no divisor vanishes for C >= 0. If C is
+    # negative r cannot be zero, and the plain quotient loses no digits.
     C_is_positive = C >= 0
     one_minus_C = jnp.where(
         C_is_positive,
@@ -171,8 +174,8 @@ def products_of_momenta(invariants: Invariants, functions: Triple, sigma_pi: Sca
     l1, l2, l3 = invariants.momentum
     delta, _, _, product_less_delta = _quotients(invariants, functions)
     square = S * S
-    # (1 - C)/r - p (l2 S)^2 and (1 - N)/p - r (l2 S)^2: on a spin about the middle axis the second
-    # term takes all but the last digits of the first.
+    # (1 - C)/r - p (l2 S)^2 and (1 - N)/p - r (l2 S)^2, rewritten: for a rotation about the
+    # intermediate axis these differences cancel.
     C_is_positive = C >= 0
     one_minus_C = (invariants.s * l3 * l3 - invariants.p * l2 * l2 * C) * jnp.where(
         C_is_positive,
@@ -199,7 +202,7 @@ def _off_diagonal_responses(
     aspherical = s > 0
     divisor = jnp.where(aspherical, s, 1)
     C_is_positive = C >= 0
-    # (p C + r N) / s, whose derivative in a nearly spherical body is not to be divided by s.
+    # (p C + r N) / s, without a division by s, which is small for a nearly spherical body.
     blend_share = (
         p
         * r
@@ -259,7 +262,8 @@ def _off_diagonal_responses(
 
 
 def invariants_variation(polhode: Polhode, variation: Variation):
-    """Variations of r, s, p, A, B and B r - A p, but for the tensor's entries 12, 13, 23."""
+    """Variations of r, s, p, A, B and B r - A p, without those by entries 12, 13, 23 of the
+    tensor."""
     (l1, l2, l3), (e1, e2, e3) = polhode.momentum, variation.inverse_moments
     g1, g2, g3 = variation.momentum
     dp, dr, ds = (polhode.sense * d for d in (e1 - e2, e2 - e3, e1 - e3))
@@ -304,13 +308,13 @@ def momentum_tangent(
     )
 
 
-# Squares of the phase below which the series serves: its next term is then below the last bit, and
-# the quotient of differences loses no more than a factor of sixty.
+# Square of the phase below which the series is used. Its next term is then below the last bit; for
+# larger phases the error of the quotient of differences is at most sixty times rounding.
 _SHORT = 2.0**-12
 
 
 def _spread(invariants: Invariants, S: Scalars, first: Scalars, t: Scalars, is_short, divisor):
-    """((l2)^2 (t - S) - A B first) / s: a series where s may vanish."""
+    """((l2)^2 (t - S) - A B first) / s; for short times, when s may vanish, by a series."""
     (l1, l2, l3), p, r, _, A, B = invariants
     x, y = B * r, A * p
     b, a = B * l1 * l1, A * l3 * l3
@@ -333,7 +337,7 @@ def squares_of_momenta(
     sigma_pi = polhode.sense * polhode.parity
     invariants = Invariants(polhode.momentum, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
     square_2 = polhode.A * polhode.B * first + S * l2 * momentum_at_t[1]
-    # (l2^2 t - middle) / s, of which the change of L2 is a part.
+    # (l2^2 t - square_2) / s, which contains the change of L2
     is_short = (polhode.B * polhode.r + polhode.A * polhode.p) * t * t < _SHORT
     divisor = jnp.where(is_short, 1, polhode.s)
     delta, _, _, product_less_delta = _quotients(invariants, functions)
@@ -347,7 +351,8 @@ Quadruple = tuple[Scalars, Scalars, Scalars, Scalars]
 
 
 class Frame:
-    """Passage between x, y, z and the right-handed axes 1, 2, 3 on which L3 is positive."""
+    """Transformation between x, y, z and axes 1, 2, 3; ``reflected``: between the latter and
+    right-handed axes with a positive L3."""
 
     def __init__(self, polhode: Polhode):
         self.polhode = polhode
@@ -377,7 +382,7 @@ def quaternion_product(a: Quadruple, b: Quadruple) -> Quadruple:
 
 
 def apply_variation(variation: Variation, vector: Triple) -> Triple:
-    """The variation of the inverse tensor, applied."""
+    """The variation of the inverse tensor times a vector."""
     a, b, c = vector
     diagonal_part = triple(e * x for e, x in zip(variation.inverse_moments, vector, strict=True))
     if variation.off_diagonal is None:

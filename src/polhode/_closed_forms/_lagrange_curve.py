@@ -1,21 +1,22 @@
 """Lagrange's top on its elliptic curve: a symmetric body, its centre on the axis, uniform gravity.
 
-With u the vertical, g = u . e3, N = 2 A M (M the moment of the weight), p and b the momenta about
-the vertical and the axis, (A dg/dt)^2 = f(g) = 2 A (E - M g)(1 - g^2) - (p - b g)^2, a cubic. On
-its curve the Cayley-Klein parameters alpha = w + iz, beta = y + ix (of the attitude against u) are
-an exponential times a quotient of theta functions (Klein & Sommerfeld, Theorie des Kreisels,
-VI.5). Here each is written
+Let u be the vertical, g = u . e3, M the moment of the weight, N = 2 A M, and p and b the momenta
+about the vertical and the axis. Then (A dg/dt)^2 = f(g) = 2 A (E - M g)(1 - g^2) - (p - b g)^2, a
+cubic. On its elliptic curve the Cayley-Klein parameters alpha = w + iz and beta = y + ix (of the
+attitude relative to u) are an exponential times a quotient of theta functions (Klein & Sommerfeld,
+Theorie des Kreisels, VI.5). Here they are written as
 
     alpha(t) = exp(i k t) (c - d F) (h F E/x) (x E'/F) / ((F E) (E'/F)),   F = exp(2 i nu t),
 
-(a) = (a; h) as in ``_lagrange_series``, E the place of the initial state on the curve (E' = h/E),
-x the place where alpha vanishes. E, E', x, h/x, nu, k are analytic functions of the initial state
-even where the nutation vanishes (regular precession, sleeping and hanging tops), and c, d are
-linear in alpha and its rate: values and derivatives are regular there and at both poles.
+where (a) = (a; h) as in ``_lagrange_series``, E is the coordinate of the initial state on the
+curve, E' = h/E, and x is the coordinate of the point where alpha vanishes. E, E', x, h/x, nu and k
+are analytic functions of the initial state, even where the nutation vanishes (regular precession,
+sleeping and hanging tops), and c and d are linear in alpha and its rate. Therefore values and
+derivatives are regular there and at both poles.
 
-When the two lower roots of f are the close pair, nu is real and E' = conj(E). When the two upper
-ones are (near the separatrix), the cubic is reversed: nu is imaginary, E and E' are real, and
-time is reduced by whole periods. In both h <= exp(-2 pi).
+If the two lower roots of f are the close pair, nu is real and E' = conj(E). If the two upper ones
+are (near the separatrix), the cubic is reversed: nu is imaginary, E and E' are real, and time is
+reduced by whole periods. In both cases h <= exp(-2 pi).
 """
 
 import math
@@ -42,18 +43,21 @@ from polhode._kernels import opaque_ones, spread, staged
 
 
 class Cubic(NamedTuple):
-    """f about the present g, reversed where needed so that its third root is the isolated one.
+    """f as a polynomial in g minus its initial value, reversed if needed so that its third root is
+    the isolated one.
 
-    ``momentum_unit`` [kg m^2/s]: momenta below are in this unit; ``nutating``: whether it and the
-    frequency of the nutation differ from 0; ``circular``: whether the motion lies between the first
-    two roots (the lower pair of f), else it lies between the third and the second (the upper pair
-    is the close one); ``sign``: -1 where g was reversed; ``axial_momentum``: about the axis;
-    ``nutation`` = A dg/dt; ``horizontal_product``: scalar product of the horizontal momentum and
-    the vertical; ``one_plus_g``, ``one_minus_g``; ``leading``: size of the leading coefficient;
-    ``root_sum``, ``root_product``: of the first two roots, counted from g; ``third_distance``:
-    distance of the third root times ``leading``; ``mean_distance``: geometric mean of the distances
-    of the third root from the two others, times ``leading``; ``width``: (sum of the square roots of
-    those distances)^2.
+    - ``momentum_unit`` [kg m^2/s]: unit of all momenta below;
+    - ``nutating``: whether this unit and the frequency of the nutation differ from 0;
+    - ``circular``: whether the motion is between the first two roots (the lower pair of f);
+      otherwise it is between the third and the second (the upper pair is the close one);
+    - ``sign``: -1 where g was reversed;
+    - ``axial_momentum``: about the axis; ``nutation`` = A dg/dt; ``horizontal_product``: scalar
+      product of the horizontal momentum and the vertical; ``one_plus_g``, ``one_minus_g``;
+    - ``leading``: absolute value of the leading coefficient;
+    - ``root_sum``, ``root_product``: of the first two roots minus g;
+    - ``third_distance``: distance of the third root from g times ``leading``;
+    - ``mean_distance``: geometric mean of the distances of the third root from the two others,
+      times ``leading``; ``width``: (sum of the square roots of those distances)^2.
     """
 
     momentum_unit: Array
@@ -84,12 +88,12 @@ class Cubic(NamedTuple):
 
 
 def where_or_one(condition: Array, value: Array) -> Array:
-    """The value where the condition holds, else 1: keeps unused branches finite."""
+    """The value where the condition is true, else 1, so that unused branches are finite."""
     return jnp.where(condition, value, 1)
 
 
 def positive(x: Array) -> Array:
-    """x, or the smallest positive number where rounding made it zero or negative."""
+    """x, or the smallest positive number where x is zero or negative by rounding."""
     return jnp.where(x > 0, x, jnp.finfo(x.dtype).tiny)
 
 
@@ -104,8 +108,8 @@ def _third_of_angle(x: Array) -> Array:
 
 @jax.custom_jvp
 def _isolated_root(f2: Array, f1: Array, f0: Array) -> tuple[Array, Array, Array]:
-    """Of y^3 + f2 y^2 + f1 y + f0 (three real roots): the root farther from the middle one,
-    whether it is the greatest, and a third of the spread of the roots."""
+    """The isolated root of y^3 + f2 y^2 + f1 y + f0 (three real roots), the one farther from the
+    middle root; whether it is the greatest; and a third of the spread of the roots."""
     q = (f2 * f2 - 3 * f1) / 9
     r = (2 * f2**3 - 9 * f2 * f1 + 27 * f0) / 54
     greatest = r <= 0
@@ -114,8 +118,9 @@ def _isolated_root(f2: Array, f1: Array, f0: Array) -> tuple[Array, Array, Array
     ratio = jnp.where(cube > 0, jnp.abs(r) / where_or_one(cube > 0, cube), 1)
     part = 2 * size * _third_of_angle(jnp.minimum(ratio, 1))
     y = jnp.where(greatest, part, -part) - f2 / 3
-    # Newton steps remove the rounding of the trigonometric root. The isolated root is the one whose
-    # derivative is farthest from zero, so that nothing is divided by the distance of a close pair.
+    # Newton steps remove the rounding error of the trigonometric root. The derivative of the cubic
+    # is farthest from zero at the isolated root, so that the divisor does not become small for a
+    # close pair.
     for _ in range(2):
         derivative = (3 * y + 2 * f2) * y + f1
         y = y - jnp.where(
@@ -133,7 +138,7 @@ def _isolated_root_rule(primals, tangents):
     derivative = (3 * y + 2 * f2) * y + f1
     inverse = -jnp.where(derivative > 0, 1 / where_or_one(derivative > 0, derivative), 0)
     dy = inverse * d0 + (inverse * y) * d1 + (inverse * y * y) * d2
-    # The others only choose between formulas.
+    # the other results only select formulas
     none = np.zeros(greatest.shape, jax.dtypes.float0)
     return (y, greatest, size), (dy, none, jnp.zeros_like(size))
 
@@ -153,7 +158,7 @@ def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...
     g = (one_plus_g - one_minus_g) / 2
     horizontal_product, nutation = u1 * l1 + u2 * l2, u1 * l2 - u2 * l1
     flat, lying = l1 * l1 + l2 * l2, u1 * u1 + u2 * u2
-    # f0 + f1 x + f2 x^2 + n x^3 about g: f0 and f1 are small without cancellation near the poles
+    # f0 + f1 x + f2 x^2 + n x^3 about g: near the poles f0 and f1 are small without cancellation
     f0 = nutation * nutation
     f1 = 2 * b * horizontal_product - 2 * g * flat - n * lying
     f2 = 2 * n * g - flat - b * b
@@ -167,17 +172,18 @@ def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...
         jnp.where(sign > 0, one_plus_g, one_minus_g),
         jnp.where(sign > 0, one_minus_g, one_plus_g),
     )
-    # The first form is accurate for a pair close to g, the second for a g close to the third root.
-    pair_is_close = (~circular) & (jnp.abs(y) < size)
-    third_root_distance = where_or_one(~pair_is_close & (y != 0), y)
+    # The sum and the product of the other two roots: by f2 and f1 if g is close to the third root
+    # (y is small); otherwise by f1 and f0, which is accurate for a pair close to g.
+    third_is_close = (~circular) & (jnp.abs(y) < size)
+    third_root_distance = where_or_one(~third_is_close & (y != 0), y)
     root_sum = jnp.where(
-        pair_is_close,
-        -(f2 + y) / where_or_one(pair_is_close, n),
+        third_is_close,
+        -(f2 + y) / where_or_one(third_is_close, n),
         (f1 + n * f0 / third_root_distance) / third_root_distance,
     )
     root_product = jnp.where(
-        pair_is_close,
-        (f1 - root_sum * y) / where_or_one(pair_is_close, n),
+        third_is_close,
+        (f1 - root_sum * y) / where_or_one(third_is_close, n),
         -f0 / third_root_distance,
     )
     distances = side * (2 * y - n * root_sum)
@@ -204,8 +210,8 @@ def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...
 
 
 class CayleyKlein(NamedTuple):
-    """One Cayley-Klein parameter: coefficients c and d, the place x of its zero and h/x, its rate
-    k, the angle of x, and whether its modulus grows by F^(-1/2) where F is real."""
+    """One Cayley-Klein parameter: the coefficients c and d, the coordinate x of its zero and h/x,
+    its rate k, the angle of x, and whether its modulus has a factor F^(-1/2) if F is real."""
 
     c: Complex
     d: Complex
@@ -217,10 +223,10 @@ class CayleyKlein(NamedTuple):
 
 
 class LagrangeConstants(NamedTuple):
-    """A motion of Lagrange's top, ready to be evaluated at any time (arrays of lanes).
+    """The constants of a motion of Lagrange's top, for any time (arrays of lanes).
 
     ``start``, ``partner``: E and h/E; ``nu`` [rad/s]: its real or imaginary part; ``spinors``:
-    alpha and beta, stacked in front.
+    alpha and beta, stacked along a new first axis.
     """
 
     series: Series
@@ -240,13 +246,13 @@ def _stack(*trees):
 
 
 def _row(tree, rows: int):
-    """Lanes (rows, N), to go with several values per lane."""
+    """Lanes repeated as (rows, N), for several values per lane."""
     return spread(tree, 0, rows)
 
 
 def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
-    """The pair a, b with the product ``times``: beside a large one the other, which may be nothing
-    but rounding, is computed from the product. Near three equal roots both are left as they are."""
+    """The pair a, b with the product ``times``: if one is large, the other one, which may consist
+    of rounding alone, is computed from the product. Near three equal roots neither is changed."""
     first, second = (x.square > 1 / 4 for x in (a, b))
     large = where(first, a, where(second, b, Complex(jnp.ones_like(a.re), jnp.zeros_like(a.re))))
     other = large.inverse * times
@@ -254,11 +260,13 @@ def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]
 
 
 def _places(f: Cubic, c: Curve, raw: Array):
-    """Places of the state, of g = -1 and of g = 1 (before the reversal), and their partners."""
+    """Coordinates of the state, of g = -1 and of g = 1 (before the reversal) on the curve, and
+    their partners h/E."""
     circular = f.circular
     zero = jnp.zeros_like(f.nutation)
-    # Twice dg/du at the place over the root of its depth; nearer to the third root (where that
-    # bounds the motion) the square root of the turned depth instead.
+    # Twice dg/du at the point, divided by the root of its distance (``depth``) from the third root.
+    # Close to the third root, if that bounds the motion, the signed root of the depth itself: the
+    # nutation over the root of the product of the distances from the two other roots.
     state_close = (~circular) & (f.third_distance < f.mean_distance / 2)
     state_span = jnp.sqrt(where_or_one(state_close, f.root_product))
     state_push = 2 * f.nutation / jnp.sqrt(where_or_one(~state_close, positive(f.third_distance)))
@@ -326,9 +334,9 @@ def _places(f: Cubic, c: Curve, raw: Array):
 
 
 def _staged_start(c: Curve, start: Complex, partner: Complex):
-    """E and h/E with the product h; near the separatrix the smaller one may be mere rounding.
+    """E and h/E with the product h; near the separatrix the smaller one may be rounding alone.
 
-    E and E/h are the same place: the one far from 0 determines the other, unless both are small.
+    E and E/h are the same point: the larger one determines the other, unless both are small.
     """
     large, other = start.square > _SMALL**2, partner.square > _SMALL**2
     one = Complex(jnp.ones_like(c.h), jnp.zeros_like(c.h))
@@ -340,7 +348,7 @@ def _staged_start(c: Curve, start: Complex, partner: Complex):
 
 
 _SMALL = 0.05
-"""Above the greatest nome exp(-pi), which |E| is where E and h/E are conjugate."""
+"""A bound above the largest nome exp(-pi), which is the largest |E| if E and h/E are conjugate."""
 
 
 def lagrange_constants(
@@ -353,9 +361,9 @@ def lagrange_constants(
     """The motion through a state.
 
     ``transverse``: moment A [kg m^2]; ``spin``: omega_z [rad/s]; ``pull``: M [N m] of either sign
-    in V = M u . e3; ``spinor``: alpha = w + iz and beta = y + ix of the attitude against u, of unit
-    length; ``momentum``: body components [kg m^2/s], that of wheels on the axis included. All of
-    one shape.
+    in V = M u . e3; ``spinor``: alpha = w + iz and beta = y + ix of the attitude relative to u, of
+    unit length; ``momentum``: body components [kg m^2/s], including that of wheels on the axis. All
+    of one shape.
     """
     alpha, beta = spinor
     product = alpha * beta
@@ -404,15 +412,15 @@ def lagrange_constants(
     theta, slope = staged(unpaired(ahead, behind, series, one), one)
     inverse = staged(theta.inverse, one)
     inner = staged(base + slope * inverse, one)
-    # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
+    # From the rate at the start. Without nutation (nu = 0) only the phase changes.
     precession_rate = (rate * value.conj).im / where_or_one(value.square > 0, value.square)
     k = -(nu_complex * (1 + 2 * log_derivative)) - axial / 2
     k = staged(where(nutating, k, Complex(precession_rate, zero)), one)
     drift = (k * value).times_i - rate
     d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
     d = staged(where(nutating, d, Complex(zero, zero)), one)
-    # d : c = E : x. Where one of them is far below the other, the difference from the rate would
-    # leave it rounding, which exp(2 i nu t) near the separatrix makes large.
+    # d : c = E : x. If one of them is far below the other, its formula by the rate would give
+    # rounding alone, which exp(2 i nu t) amplifies near the separatrix.
     hyperbolic = nutating & ~circular
     first = hyperbolic & (4 * start.square < x.square)
     second = hyperbolic & (4 * x.square < start.square)
@@ -440,9 +448,9 @@ def lagrange_constants(
 
 
 def _log_derivative(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
-    """Difference of the logarithmic slopes at x and h/x, for the places of g = -1 and g = 1.
+    """Difference of the logarithmic derivatives at x and h/x, for the points of g = -1 and g = 1.
 
-    Of g = -1 it comes of the pair x, h/x, of g = 1 of h x, h/x: their sums are real.
+    For g = -1 it is computed from the pair x, h/x, for g = 1 from h x, h/x, whose sums are real.
     """
     ones = jnp.ones_like(c.h)
     argument = x * jnp.stack([ones, c.h])
@@ -457,7 +465,7 @@ def cayley_klein(o: LagrangeConstants, elapsed: Array) -> tuple[Complex, Complex
     """alpha, beta and omega_y + i omega_x at times [s] that broadcast against the lanes."""
     series, circular = o.series, o.circular
     angle = 2 * o.nu * elapsed
-    # Whole periods of real exponentials; on the separatrix itself there is none.
+    # Reduction by whole periods of the real exponentials; on the separatrix there is no period.
     periodic = ~circular & (series.h > 0)
     period = -jnp.log(where_or_one(periodic, series.h))
     count = jnp.round(angle / where_or_one(periodic, period))
@@ -474,8 +482,8 @@ def cayley_klein(o: LagrangeConstants, elapsed: Array) -> tuple[Complex, Complex
     below = pair(forward.re + backward.re, series.h, jnp.ones_like(series.h), series, one)[0]
     below = staged(1 / below, one)
 
-    # Both parameters as rows of the same arrays: their formulas stand in the program once, which
-    # takes a twelfth less time to compile with derivatives, and as long to run.
+    # Both parameters are rows of the same arrays, so that the program contains their formulas once.
+    # With derivatives it compiles in a twelfth less time, and runs as fast.
     f, forward, backward, below, half, series, circular, nu, count, elapsed = _row(
         (f, forward, backward, below, half, series, circular, 2 * o.nu, count, elapsed), 2
     )

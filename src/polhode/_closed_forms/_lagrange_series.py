@@ -1,11 +1,11 @@
 """Theta functions in Tate's form: the infinite product (a; h) = prod over n >= 0 of (1 - h^n a).
 
 theta1(z) with nome q is, up to constants and a factor exp(-iz), the product (a; h)(h/a; h) with
-a = exp(2iz), h = q^2 (Jacobi's triple product, NIST DLMF 20.5.1). Written so it depends on a and
+a = exp(2iz), h = q^2 (Jacobi's triple product, NIST DLMF 20.5.1). In this form it depends on a and
 h/a, both of which are regular where the amplitude of a motion vanishes.
 
-Complex numbers are pairs of real arrays: real and complex mix freely, nothing is promoted, and XLA
-makes vector code of them.
+Complex numbers are pairs of real arrays, because XLA compiles real arithmetic to vector
+instructions, and products with real arrays need no promotion.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from polhode._kernels import opaque_ones, staged
 
 
 class Complex(NamedTuple):
-    """``re + i im``; the other operand of + - * may be a real array or a number."""
+    """``re + i im``; the second operand of +, - and * may be a real array or a number."""
 
     re: Array
     im: Array
@@ -67,12 +67,12 @@ class Complex(NamedTuple):
 
     @property
     def root(self) -> "Complex":
-        """Principal square root of a number off the negative real axis, |arg| < 2 pi/3 or so."""
+        """Principal square root of a number far from the negative real axis (|arg| < 2 pi/3)."""
         re = jnp.sqrt((jnp.sqrt(self.square) + self.re) / 2)
         return Complex(re, self.im / (2 * re))
 
     def at(self, lanes) -> "Complex":
-        """The parts indexed alike."""
+        """Both parts, indexed."""
         return Complex(self.re[lanes], self.im[lanes])
 
 
@@ -82,12 +82,12 @@ def unit(angle: Array) -> Complex:
 
 
 def where(condition: Array, a: Complex, b: Complex) -> Complex:
-    """Elementwise choice."""
+    """``jnp.where`` of complex numbers."""
     return Complex(jnp.where(condition, a.re, b.re), jnp.where(condition, a.im, b.im))
 
 
 _TERMS = 5
-"""Of Euler's series: the coefficient of a^k falls like h^(k (k - 1)/2), and h <= exp(-2 pi)."""
+"""Terms of Euler's series: the coefficient of a^k falls like h^(k (k - 1)/2), h <= exp(-2 pi)."""
 
 
 class Series(NamedTuple):
@@ -99,7 +99,7 @@ class Series(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """One elliptic curve: ``h`` = q^2 <= exp(-2 pi), and what the map of its points needs.
+    """One elliptic curve: ``h`` = q^2 <= exp(-2 pi), and the constants of the map ``point``.
 
     ``square`` is lambda^2, lambda the modulus after one descending Landen step; ``steps`` are
     lambda'/lambda^2 of the next ones, ``step_derivatives`` their derivatives with respect to
@@ -160,9 +160,9 @@ def curve(square: Array, one: Array) -> Curve:
 
 @curve.defjvp
 def _curve_rule(primals, tangents):
-    # Everything on the curve is a function of one number: its derivatives are computed once, and a
-    # tangent is a product. Differentiated as usual the recurrences would stand in the program again
-    # for every tangent.
+    # All constants are functions of one number: their derivatives are computed once, and each
+    # tangent is a product. With ordinary differentiation the program would contain the recurrences
+    # again for every tangent.
     square, one = primals
     _, derivatives = jax.jvp(_curve, (square,), (jnp.ones_like(square),))
     return curve(*primals), jax.tree.map(
@@ -171,7 +171,8 @@ def _curve_rule(primals, tangents):
 
 
 def _polynomial(a: Complex, coefficients) -> Complex:
-    """Polynomial with real coefficients, lowest first (Knuth, TAOCP 2, 4.6.4: all of it real)."""
+    """Polynomial with real coefficients, lowest first, in real arithmetic (Knuth, TAOCP 2,
+    4.6.4)."""
     twice, square = 2 * a.re, a.square
     *lower, ahead, last = coefficients
     ahead = ahead + twice * last
@@ -186,7 +187,7 @@ def _derivative_of(coefficients):
 
 
 def _pair(total: Array, times: Array, weights) -> tuple[Array, Array]:
-    # On a and b, roots of z^2 - total z + times, a polynomial is linear in z (Knuth's scheme).
+    # At a and b, the roots of z^2 - total z + times, a polynomial is linear in z (Knuth's scheme).
     def line(coefficients):
         *lower, ahead, last = coefficients
         ahead = ahead + total * last
@@ -207,7 +208,7 @@ def pair(
 ) -> tuple[Array, Array]:
     """(a; h)(b; h), and T in a d/da log (a; h) - b d/db log (b; h) = T (a - b)/((a; h)(b; h)).
 
-    Real functions of the sum and the product of a and b; the product is a function of h, of
+    Real functions of the sum and the product of a and b; the product is a function of h, with the
     derivative ``h_derivative``.
     """
     return staged(_pair(total, times, series.weights), one)
@@ -215,7 +216,7 @@ def pair(
 
 @pair.defjvp
 def _pair_rule(primals, tangents):
-    # By the sum and by h: the product of a and b is a function of h.
+    # derivatives by the sum and by h, of which the product of a and b is a function
     total, times, h_derivative, series, one = primals
     unit, zeros = jnp.ones_like(total), jnp.zeros_like(times)
     _, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (unit,))
@@ -231,7 +232,7 @@ def _pair_rule(primals, tangents):
 
 @jax.custom_jvp
 def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, Complex]:
-    """(a; h)(b; h), and a d/da less b d/db of it (Euler's series, DLMF 17.2.37)."""
+    """(a; h)(b; h), and a d/da minus b d/db of it (Euler's series, DLMF 17.2.37)."""
     both, weights = _both(a, b), _for_both(series.weights)
     value = _polynomial(both, weights)
     derivative = both * _polynomial(both, _derivative_of(weights))
@@ -241,7 +242,7 @@ def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Comple
 
 
 def _both(a: Complex, b: Complex) -> Complex:
-    """Two numbers along a new first axis: formulas of both stand in the program once."""
+    """Two numbers along a new first axis, so that the program contains their formulas once."""
     return jax.tree.map(lambda x, y: jnp.stack([x, y]), a, b)
 
 
@@ -250,7 +251,7 @@ def _for_both(weights: tuple[Array, ...]) -> list[Array]:
 
 
 def rows_of_ones(rows: int, x: Array) -> Array:
-    """Ones (rows, *x.shape) that are not a broadcast to XLA, not even those of one body."""
+    """``opaque_ones`` (rows, *x.shape) that are not a broadcast, even for one body."""
     scale = jnp.arange(1, rows + 1, dtype=x.dtype)
     return opaque_ones(x[None] * scale.reshape(-1, *(1,) * x.ndim))
 
@@ -290,8 +291,8 @@ def _descend(e: Complex, partner: Complex, c: Curve, one: Array) -> Complex:
     ``e`` and ``partner`` are those of n = 1. The last level, where the square is below 1e-20, is
     summed in closed form, so that e may be large.
     """
-    # From the last level up: each takes the square root of what lies below it. These roots stay on
-    # the principal branch, which a root of the product of all levels would leave.
+    # From the last level to the first: each takes the square root of the product of later levels.
+    # These roots are on the principal branch; a single root of the whole product would not be.
     *levels, (_, _, roots) = _levels(e, partner, c, one)
     total = (1 + roots[1]) * (1 + roots[0]).inverse
     total = staged((levels[1][2] * (total * total)).root, one)
@@ -300,7 +301,8 @@ def _descend(e: Complex, partner: Complex, c: Curve, one: Array) -> Complex:
 
 
 def _levels(e: Complex, partner: Complex, c: Curve, one: Array):
-    """e, its partner and (1 + partner)/(1 + e) of each level; of the last the roots of 1 + both."""
+    """e, its partner and (1 + partner)/(1 + e) of each level; for the last level the roots of 1 + e
+    and 1 + partner instead of the quotient."""
     levels = []
     for step in c.steps[1:]:
         ratio = staged((1 + partner) * (1 + e).inverse, one)
@@ -342,9 +344,8 @@ def point(
 ):
     """Coordinate E of a point on the curve and h/E, without constant factors.
 
-    From twice the amplitude as exponentials ``factor_e``, ``partner_factor`` (times lambda, and one
-    half of the first Landen step taken), whose squares times ``scale_of_squares`` are those of the
-    next level.
+    ``factor_e``, ``partner_factor``: exponentials of twice the amplitude (times lambda, after half
+    of the first Landen step), whose squares times ``scale_of_squares`` are those of the next level.
     """
     factor = staged(
         _descend(

@@ -1,28 +1,29 @@
 """Lagrange's top as a closed form: the method, the frame of the vertical, and two limits.
 
 The closed form (``_lagrange_curve``) measures momenta in units of (L^2 + 2 A |M|)^(1/2), M the
-moment of the weight. Where that unit or the direction of the weight does not exist, two other
-formulas take over:
+moment of the weight. If that unit or the direction of the weight does not exist, two other formulas
+are used:
 
-``short_motion``: times so short that one step of Runge and Kutta is exact to rounding. At rest
-without weight there is no unit of momentum, and with little weight the derivatives by it are the
-difference of large numbers. The equations of motion are regular there: a body at rest stays at
+``short_motion``: for times so short that the error of one Runge-Kutta step is below rounding. At
+rest without weight there is no unit of momentum, and with little weight the derivatives by it are
+differences of large numbers. The equations of motion are regular there: a body at rest remains at
 rest. A step of fourth order has all terms of first and second derivatives by state and weight.
-Less its turn about its own axis at omega_z - L_z/A, the body moves as a sphere of moment A does:
-with q its attitude, e = R z the axis and r e the place where the weight F acts, in space axes,
+Apart from a rotation about its own axis at omega_z - L_z/A, the body moves like a sphere of moment
+A. If q is the attitude of the sphere, e = R z the axis, and r e the point at which the weight F
+acts, in space axes,
 
     dL/dt = r e x F,    dq/dt = (0, L) q / (2 A).
 
-``with_weight``: derivatives of the motion without weight by the weight, whose direction the closed
-form needs; the motion is analytic in its three components all the same. The sphere above turns as
-R(t) = exp(t [w]x) R(0), at the constant rate w = L/A in space axes. A small weight F at r e changes
-its momentum and attitude by
+``with_weight``: derivatives of the motion without weight by the weight. The closed form needs the
+direction of the weight, although the motion is analytic in its three components. The sphere above
+rotates as R(t) = exp(t [w]x) R(0), at the constant rate w = L/A in space axes. A small weight F at
+r e changes its momentum and attitude by
 
     dL(t) = r I(t) x F,    I(t) = integral of e from 0 to t,
     dtheta(t) = r / A  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
 
-dtheta a rotation vector in space axes. With n = w/|w| and x = |w| t both are sums of powers of [n]x
-times functions of x.
+where dtheta is a rotation vector in space axes. With n = w/|w| and x = |w| t both are sums of
+powers of [n]x times functions of x.
 """
 
 from typing import Any
@@ -65,14 +66,15 @@ from polhode._scene import Scene, UniformGravity, Wheels
 class LagrangeTop(AbstractChunkedForm):
     """Lagrange's top in theta functions, O(1) in time: exact.
 
-    A body symmetric about body z (``ph.Inertia.axisymmetric``) turning about a point of that axis
-    under uniform gravity in any direction, its centre of mass on the axis
-    (``ph.UniformGravity.axial``), wheels of constant momentum on the axis allowed. All motions:
-    looping, cuspidal and regular precession, sleeping and hanging tops, the separatrix, the
-    pendulum, no gravity. The error is rounding: a few units in the last place of the phase.
-    Derivatives are those of symmetric bodies. Next to the marginal sleeping top (L_z^2 = 4 A m g l,
-    axis and rates within 1e-9 of upright) their relative error is 1e-8, on it 1e-2; values are
-    accurate there. ``chunk`` bounds bodies times samples worked on at once (None: chosen).
+    A body symmetric about body z (``ph.Inertia.axisymmetric``) that rotates about a fixed point of
+    that axis under uniform gravity in any direction, with its centre of mass on the axis
+    (``ph.UniformGravity.axial``). Wheels of constant momentum on the axis are permitted. All
+    motions: looping, cuspidal and regular precession, sleeping and hanging tops, the separatrix,
+    the pendulum, no gravity. The error is rounding: a few units in the last place of the phase.
+    Derivatives are those within the class of symmetric bodies. Close to the marginal sleeping top
+    (L_z^2 = 4 A m g l, axis and rates within 1e-9 of upright) their relative error is 1e-8, on it
+    1e-2; values are accurate there. ``chunk``: maximum bodies times samples that are computed at
+    once (None: chosen by the library).
 
     Source: Klein & Sommerfeld, Theorie des Kreisels, chapter VI.
     """
@@ -117,11 +119,11 @@ class LagrangeTop(AbstractChunkedForm):
 
 
 def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
-    """Quaternion (w, x, y; z = 0) from space z to an axis along +-force (never downwards), and the
-    signed size of the force along it.
+    """Quaternion (w, x, y; z = 0) from space z to an axis along the force or against it, with a
+    positive z component, and the signed size of the force along this axis.
 
-    Without force the axis is z: the motion does not depend on it. The derivatives by the force are
-    then those of ``with_weight``.
+    Without force the axis is z: the motion does not depend on it, and ``with_weight`` has the
+    derivatives by the force.
     """
     square = sum(x * x for x in force)
     acting = square > 0
@@ -157,21 +159,22 @@ def lagrange_motion(
 ) -> tuple[Float[Array, "n t 4"], Float[Array, "n t 3"]]:
     """Attitude and body rates after ``elapsed`` [s] of a symmetric body about a fixed point.
 
-    ``transverse``: moment about any axis through the point and across body z [kg m^2];
+    ``transverse``: moment about any axis through the point perpendicular to body z [kg m^2];
     ``force_space``: weight [N], space axes, acting at ``distance`` [m] along body z; ``wxyz``,
-    ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
-    the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI. The closed form is
-    ``_long_motion``; ``short_motion`` replaces it where the body hardly moves in that time, and
-    ``with_weight`` gives the derivatives by a force that is zero.
+    ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], including that of
+    wheels on the axis. Klein & Sommerfeld, Theorie des Kreisels, VI. The closed form is
+    ``_long_motion``; ``short_motion`` replaces it if the body hardly moves in that time, and
+    ``with_weight`` has the derivatives by a force that is zero.
     """
-    # Two motions are beyond the closed form: its constants for a body that hardly moves are
-    # quotients of rounding errors, and without weight its derivatives by the weight are 0/0. Both
-    # have plain formulas, which are evaluated only if a body of the batch needs them.
+    # The closed form fails in two cases: for a body that hardly moves its constants are quotients
+    # of rounding errors, and without weight its derivatives by the weight are 0/0. Both have plain
+    # formulas, which are evaluated only if a body of the batch needs them.
     arguments: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
     constants = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
     angle = momentum_frequency(*constants)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
     short = angle < short_angle(elapsed.dtype)
-    # Derivatives of the closed form would be NaN there: it is evaluated for another motion.
+    # Derivatives of the closed form would be NaN for these bodies: it is evaluated for another
+    # motion.
     at_rest = jnp.all(short, axis=-1)[:, None]
     weightless = jnp.all(force_space == 0, axis=-1, keepdims=True)
     force = jnp.where(at_rest | weightless, 0, force_space)
@@ -180,8 +183,8 @@ def lagrange_motion(
     closed_form: Any = kernel(_long_motion, repeated=True)
     motion = closed_form(*other)
 
-    # Body by body: side by side the program of this branch, which is hardly ever taken, would be
-    # a third of the compilation of a gradient.
+    # For one body at a time: for all at once, this rarely used branch would take a third of the
+    # compilation of a gradient.
     def with_corrections(motion, arguments, elapsed):
         corrected: Any = kernel(_corrected, repeated=True)
         lanes = list(motion), arguments, elapsed, short, weightless, at_rest
@@ -196,7 +199,7 @@ def lagrange_motion(
 
 
 def _corrected(motion, arguments: Any, elapsed, short, weightless, at_rest) -> Any:
-    """The motion with what the closed form does not have: see ``lagrange_motion``."""
+    """The motion with the two cases that the closed form lacks: see ``lagrange_motion``."""
     transverse, force, distance, wxyz, omega, axial = arguments
     small = short_motion(
         transverse, force, distance, wxyz, omega, axial, jnp.where(short, elapsed, 0)
@@ -210,8 +213,8 @@ def _corrected(motion, arguments: Any, elapsed, short, weightless, at_rest) -> A
 
 def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum, elapsed):
     """The closed form, arguments and results as of ``lagrange_motion``."""
-    # The compiler makes a loop of every axis, be it of length one, and vectors of the last axis
-    # only: axes of length one are left out, and the longer one comes last.
+    # XLA compiles a loop for every axis, even of length one, and vectorises the last axis only:
+    # axes of length one are removed, and the longer axis is last.
     lanes, count = elapsed.shape
     times, axis = elapsed, -1
     arguments = transverse, force_space, distance, wxyz, omega, axial_momentum
@@ -226,8 +229,8 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
     wxyz, omega = staged((jnp.unstack(wxyz, axis=-1), components(omega)), one)
     tilt, force_component = staged(upward(components(force_space)), one)
     inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
-    # In axes along the force the motion is that of the textbook. As spinors (Cayley-Klein) instead
-    # of angles it has no pole where the body stands upright.
+    # In axes along the force the motion is that of the textbook. Spinors (Cayley-Klein parameters)
+    # have no pole where the body is upright, unlike Euler angles.
     q, spin = staged(_times_tilt(inverse_tilt, wxyz), one), omega[2]
     momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
@@ -237,7 +240,7 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
         motion, h, tilt, spin = spread(
             (motion._replace(series=None), series.h, tilt, spin), axis, count
         )
-        # apart, for no cotangents but that of h need be summed
+        # separately, because of the series only h has cotangents to be summed
         weights = spread((series.weights, series.derivatives), axis, count)
         motion = motion._replace(series=Series(h, *weights))
     alpha, beta, across = cayley_klein(motion, times)
@@ -257,15 +260,16 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
 def momentum_frequency(
     transverse: Array, force: Array, distance: Array, omega: Array, axial: Array
 ):
-    """(L^2 + 2 A |M|)^(1/2) / A (N,) [rad/s]; 0 for a body that stays at rest."""
+    """(L^2 + 2 A |M|)^(1/2) / A (N,) [rad/s]; 0 for a body that remains at rest."""
     weight = jnp.sqrt(jnp.sum(force * force, axis=-1)) * jnp.abs(distance)
     across = jnp.sum(omega[:, :2] ** 2, axis=-1)
     return jnp.sqrt(across + (axial / transverse) ** 2 + 2 * weight / transverse)
 
 
 def short_angle(dtype) -> float:
-    """``momentum_frequency`` times the time [rad] up to which the step is exact to rounding."""
-    # The local error of fourth order is taken as angle^5 / 100.
+    """``momentum_frequency`` times the time [rad] up to which the error of the step of
+    ``short_motion`` is below rounding."""
+    # The local error of the step of fourth order is estimated as angle^5 / 100.
     return (100 * float(jnp.finfo(dtype).eps)) ** (1 / 5)
 
 
@@ -291,9 +295,9 @@ def short_motion(
         ),
     )
 
-    # One Runge-Kutta step of order 4, in space axes and without the rotation about the axis of
-    # symmetry, which is exact and added at the end: the fast spin of a top would shorten the time
-    # for which the step is exact to rounding.
+    # One Runge-Kutta step of order 4, in space axes. The rotation about the axis of symmetry is
+    # known exactly and added at the end: the fast spin of a top would shorten the time for which
+    # the error of the step is below rounding.
     def field(q, rate):
         w, x, y, z = jnp.unstack(q, axis=-1)
         a, b, c = jnp.unstack(rate, axis=-1)
@@ -333,12 +337,12 @@ def with_weight(
 ) -> list[Array]:
     """The ``motion`` without weight, with the derivatives by ``force``, which is zero.
 
-    Second derivatives by it are NaN. ``applies`` (N, 1): bodies that turn and have no weight; of
-    others the result and its derivatives are finite and unused. Other arguments as for
+    Second derivatives by it are NaN. ``applies`` (N, 1): bodies that rotate and have no weight; for
+    all others the result and its derivatives are finite and not used. Other arguments as for
     ``lagrange_motion``.
     """
 
-    # No part of a program that is not differentiated by the force: the changes are zero.
+    # The changes are zero, and computed only in programs that differentiate by the force.
     def rule(operands, tangents, values):
         if not is_slope(tangents[0]):
             return [jnp.zeros_like(x) for x in values]
@@ -362,8 +366,8 @@ def _first_order(
     rates: Array,
     applies: Array,
 ) -> list[Array]:
-    """Changes of attitude (N, T, 4) and rates (N, T, 3) of a motion without weight by a small one,
-    to first order. Arguments as for ``with_weight``.
+    """First-order changes of attitude (N, T, 4) and rates (N, T, 3) of a motion without weight by a
+    small weight. Arguments as for ``with_weight``.
     """
     moment = transverse[:, None]
     momentum = jnp.concatenate([moment * omega[:, :2], axial[:, None]], axis=-1)
@@ -371,7 +375,7 @@ def _first_order(
     size = jnp.sqrt(jnp.sum(rate * rate, axis=-1, keepdims=True))
     n = rate / size
     axis = rotation.rotate(wxyz, jnp.broadcast_to(jnp.array([0, 0, 1], n.dtype), n.shape))
-    # of bodies whose result is of no use nothing is NaN either
+    # NaN only for the bodies to which this applies
     once = derivable_once(force, jnp.broadcast_to(applies, force.shape))
     weight = once * distance[:, None]
     n_cross_axis = jnp.cross(n, axis)
@@ -380,9 +384,9 @@ def _first_order(
     )
 
     # First order in the weight, about a motion without it (n: direction of L): the torque is a sum
-    # of a constant, a cosine and a sine of x, and its integrals are closed. Differences such as
-    # 1 - cos x are written without cancellation, as x may be small.
-    # functions of x whose derivative is the one before; p: convolutions of them with sin and x
+    # of a constant, a cosine and a sine of x, whose integrals have closed forms. Differences such
+    # as 1 - cos x are written without cancellation, since x may be small. Each of the functions of
+    # x below is an integral of the one before; p1, p2, p3 are their convolutions with sin and x.
     x = (size * elapsed)[..., None]
     sine, cosine = jnp.sin(x), jnp.cos(x)
     one_less_cosine = 2 * jnp.sin(x / 2) ** 2

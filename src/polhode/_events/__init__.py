@@ -1,4 +1,4 @@
-"""Events: when a function of attitude, rates and time crosses zero, and motions that stop there."""
+"""Events: zero crossings of functions of attitude, rates and time, and motions that stop there."""
 
 from polhode._events._crossings import Crossings as Crossings, crossings as crossings
 from polhode._events._event import Event as Event, require_bodies as require_bodies

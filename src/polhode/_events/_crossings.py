@@ -1,4 +1,4 @@
-"""When a function of attitude, rates and time crosses zero along a trajectory."""
+"""Zero crossings of a function of attitude, rates and time along a trajectory."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -23,23 +23,24 @@ SAMPLES_PER_TURN = 32
 """Samples per revolution at the fastest natural rate."""
 
 _MAX_SAMPLES = 20_000_000
-"""Samples of all bodies together that fit in memory."""
+"""Maximum number of samples of all bodies, limited by the memory."""
 
 _MIN_CAPACITY = 16
-"""Minimum number of minima of the function that are examined."""
+"""Minimum number of turning points of the function that can be examined."""
 
 _SAMPLING_LOOKS = 64
-"""Looks in which all samples are taken, at most: roots take about 16 of the same width."""
+"""Maximum number of evaluations of the motion in which all samples are computed. Roots take about
+16 evaluations with the same number of times."""
 
 CAPACITY = 256
-"""Crossings of each body that the steps store unless told otherwise."""
+"""Default number of crossings of each body that the integration loop stores."""
 
 AT_START = 1e-6
-"""Part of the time between two samples within which a crossing is the start itself."""
+"""Part of the time between two samples within which a crossing counts as the start."""
 
 
 class Crossings(eqx.Module):
-    """Crossings of zero of each body, in the order of the motion.
+    """Zero crossings of a function for each body, in the order of the motion.
 
     **Fields:** ``times`` (..., M) [s], inf where there is none; ``slope`` (..., M): derivative
     of the function there [1/s], 0 where there is none; ``count`` (...): number of crossings, which
@@ -64,19 +65,19 @@ def crossings(
     capacity: int | None = None,
     samples: int | None = None,
 ) -> Crossings:
-    """Times within those of ``trajectory`` at which ``fn(wxyz, omega_body, t)`` crosses zero.
+    """Times at which ``fn(wxyz, omega_body, t)`` crosses zero during a ``trajectory``.
 
-    **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
-    rising, -1 falling (in time), 0 both, or as the event says; ``capacity``: how many crossings of
-    a body are stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and
-    ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores at most
-    256 crossings of a body.
+    **Arguments:** ``fn``: a function as in ``ph.Event``, or a ``ph.Event``; ``direction``: 1
+    rising, -1 falling (in time), 0 both, or that of the event; ``capacity``: number of crossings
+    stored for each body; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap``
+    and ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores at
+    most 256 crossings of a body.
 
     Times are as accurate as the motion: to rounding for closed forms, to ``rtol`` over the
     derivative of the function for integrated motions. Times and ``slope`` have first and second
-    derivatives, by the implicit function theorem; third derivatives raise. A zero at the first time
-    (within 1e-6 of the time between two samples) does not count as a crossing; one exactly at the
-    last time may not either: let the times go on past it.
+    derivatives, by the implicit function theorem; third derivatives raise NotImplementedError. A
+    zero at the first time (within 1e-6 of the time between two samples) does not count as a
+    crossing. A zero exactly at the last time may not be found: use a later last time.
 
     The function and its derivative are sampled 32 times per revolution of the fastest natural rate,
     the largest of |L| over the smallest moment at the saved samples and of the rate of gravity. If
@@ -87,8 +88,8 @@ def crossings(
     that rise and fall again between two saved samples need ``samples``.
 
     Raises ValueError for two different directions, if the samples do not fit into memory, if the
-    steps of a body run out (under ``jit`` it is not ``complete``), or if their number is not known
-    under ``jit``.
+    maximum number of steps of a body is reached (under ``jit`` the result is not ``complete``), or
+    if ``capacity`` or ``samples`` are missing under ``jit``.
 
         up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
         traj.at(up.times).euler()
@@ -106,7 +107,7 @@ def crossings(
     if not _propagator(trajectory).method.exact:
         step_result = _by_steps(trajectory, event, slots or CAPACITY)
         if step_result is not None:
-            _raise_if_failed(step_result[1], "the steps to the last time")
+            _raise_if_failed(step_result[1], "before the last time")
             return (
                 step_result[0]
                 if capacity is not None
@@ -121,7 +122,7 @@ def crossings(
             )
         slots = _MIN_CAPACITY
     (result,), _, has_failed = _by_sampling(trajectory, [event], slots, size)
-    _raise_if_failed(has_failed, f"the way through {size:,} samples")
+    _raise_if_failed(has_failed, f"while {size:,} samples were computed")
     while capacity is None and int(np.max(result.count, initial=0)) > slots:
         slots = 2 ** int(np.ceil(np.log2(np.max(result.count))))
         (result,), *_ = _by_sampling(trajectory, [event], slots, size)
@@ -132,9 +133,9 @@ def crossings(
 
 
 def _propagator(trajectory: Trajectory) -> Propagator:
-    """What moves the trajectory; raises ValueError where nothing does."""
+    """The propagator of the trajectory; raises ValueError if there is none."""
     for name in ("wxyz", "omega_body"):
-        require_bodies(getattr(trajectory, name))  # raises where it was not recorded, too
+        require_bodies(getattr(trajectory, name))  # raises if it was not recorded, too
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
     if not isinstance(trajectory.propagator, Propagator):
@@ -145,16 +146,16 @@ def _propagator(trajectory: Trajectory) -> Propagator:
     return trajectory.propagator
 
 
-def _raise_if_failed(has_failed: Array, way: str) -> None:
+def _raise_if_failed(has_failed: Array, where: str) -> None:
     if is_concrete(has_failed) and np.any(np.asarray(has_failed)):
         raise ValueError(
-            f"the steps of a body ran out on {way}: search a shorter time (traj.between), or ask"
-            " for more steps, ph.LiePoisson(..., max_steps=2**20)."
+            f"a body reached the limit of steps {where}: search a shorter time (traj.between), or"
+            " allow more steps, ph.LiePoisson(..., max_steps=2**20)."
         )
 
 
 def _all_of(result: Crossings, trajectory: Trajectory, event: Event) -> Crossings:
-    """All crossings, in as many columns as there are, where their number is known."""
+    """All crossings, in as many columns as needed; unchanged if their number is traced."""
     if not is_concrete(result):
         return result
     capacity = int(np.max(result.count, initial=0))
@@ -165,8 +166,8 @@ def _all_of(result: Crossings, trajectory: Trajectory, event: Event) -> Crossing
 
 @eqx.filter_jit
 def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
-    """Crossings that the steps find on their way, and for which bodies (...) these did not come to
-    the last time; None where the method does not look for them."""
+    """Crossings located during an integration, and the bodies (...) that did not reach the last
+    time; None if the method does not search for events."""
     batch = trajectory.batch_shape
     propagator: Any = trajectory.propagator
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
@@ -204,7 +205,7 @@ def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
 
 
 def _sample_count(trajectory: Trajectory) -> int:
-    """How many samples find every crossing, of a motion that is known."""
+    """Number of samples needed to find every crossing; the motion must not be traced."""
     if not is_concrete(trajectory):
         raise ValueError(
             "under jit, vmap or grad the number of samples must be known:"
@@ -214,7 +215,7 @@ def _sample_count(trajectory: Trajectory) -> int:
     size = max(
         17, 1 + int(np.ceil(SAMPLES_PER_TURN * angle / (2 * np.pi))) if np.isfinite(angle) else 17
     )
-    tolerance = 2 ** max(0, int(np.log2(size)) - 2)  # few numbers, for fewer compiled programs
+    tolerance = 2 ** max(0, int(np.log2(size)) - 2)  # few sizes, for few compiled programs
     size = 1 + -(-(size - 1) // tolerance) * tolerance
     if size * max(1, int(np.prod(trajectory.batch_shape))) > _MAX_SAMPLES:
         raise ValueError(
@@ -226,7 +227,7 @@ def _sample_count(trajectory: Trajectory) -> int:
 
 @eqx.filter_jit
 def _max_angle(trajectory: Trajectory) -> Array:
-    """Most (...) that a body may turn from the first to the last time [rad]."""
+    """Upper bound (...) of the angle of rotation from the first to the last time [rad]."""
     ts = trajectory._t
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
     rate = jnp.max(turning_rates(trajectory), axis=-1)
@@ -241,7 +242,7 @@ def turning_rates(trajectory: Trajectory) -> Array:
 
 
 def _natural_rates(trajectory: Trajectory) -> Array:
-    """Natural rates (...) [rad/s] at the first sample, gravity's included."""
+    """Natural rates (...) [rad/s] at the first sample, including that of gravity."""
     batch = trajectory.batch_shape
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     lanes = flatten(trajectory.first, batch, shared=False)
@@ -258,13 +259,13 @@ class Met(NamedTuple):
 
 
 def all_crossings(trajectory: Trajectory, events: Sequence[Event], capacity: int) -> Met:
-    """The first ``capacity`` crossings of each event in one search, of a motion that is known."""
+    """The first ``capacity`` crossings of each event in one search of a concrete trajectory."""
     _propagator(trajectory)
     sizes = [event.samples for event in events]
     default = _sample_count(trajectory) if None in sizes else 2
     size = max(default if x is None else x for x in sizes)
     met = _by_sampling(trajectory, events, capacity, size)
-    _raise_if_failed(met.has_failed, f"the way through {size:,} samples")
+    _raise_if_failed(met.has_failed, f"while {size:,} samples were computed")
     return met
 
 
@@ -295,7 +296,7 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
         return stop_gradient(Looks(values, slopes, states, is_successful))
 
     origin, samples = constant_trajectory, None
-    if not _propagator(trajectory).method.exact:  # what is stepped goes on from the nearest sample
+    if not _propagator(trajectory).method.exact:  # integrated from the nearest sample
         origin = moved_through(constant_trajectory, times)
         samples = looks(origin)._replace(states=[])
 
@@ -303,8 +304,8 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
         return looks(moved_to(origin, t.reshape(*batch, -1)))
 
     def analyse(samples):
-        """Where the function changes its sign, and where it may do so twice between two samples:
-        the first of these places, and how many there are."""
+        """The first intervals between samples in which the function changes its sign, the first in
+        which it may do so twice, and the numbers of both."""
         values, slopes = (x.reshape(-1, size) for x in (samples.values, samples.slopes))
         sides = jnp.where(values >= 0, 1, -1)
         changes = sides[:, 1:] != sides[:, :-1]
@@ -322,8 +323,8 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
         return Brackets(low, high, at_low, at_high, is_minimum)
 
     def brackets(samples, analysis, turning, turning_values):
-        """Between samples, and on both sides of turning points beyond zero, in order of time; the
-        number of all, or of all that there may be."""
+        """Brackets between samples, and on both sides of turning points beyond zero, in order of
+        time; and the number of crossings, or an upper bound of it."""
         values = samples.values.reshape(-1, size)
         (single, is_single), (place, is_minimum), changes, dipping = analysis
         sides = jnp.where(values >= 0, 1, -1)
@@ -342,7 +343,7 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
         order = jnp.argsort(jnp.where(use, time_sign * columns[0], jnp.inf), axis=-1)[:, :stored]
         per_pair = jnp.where(direction[:, 0] == 0, 2, 1)
         count = changes + per_pair * jnp.sum(pairs, axis=-1)
-        # minima beyond the stored were not looked at: there may be as many pairs of them
+        # minima beyond those stored were not examined: each may be a pair of crossings
         count = jnp.where(dipping > stored, jnp.maximum(count, per_pair * dipping), count)
         return Brackets(*(entries(x, order) for x in (*columns, use))), count
 
@@ -368,12 +369,12 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
 
 
 def _differentiable(trajectory: Trajectory, event: Event, times, use, slope, states):
-    """Slopes, times and states at events with their derivatives."""
+    """Derivatives of the function by time, times, and states at events, with their derivatives."""
     safe = jnp.where(use, times, jax.lax.stop_gradient(trajectory.ts[..., :1]))
     arrays, static = eqx.partition(trajectory, eqx.is_inexact_array)
 
     def refined(arrays, safe):
-        # of the value no more than rounding is left to correct, or of a touch all digits are noise
+        # The correction is limited to rounding: at a tangency (double root) it would be noise.
         tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
         delay, at_events = event.refined(moved_to(eqx.combine(arrays, static), safe), tolerance)
         return [event.values(at_events)[1], safe + delay, *at_events._samples]

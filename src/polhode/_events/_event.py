@@ -1,4 +1,4 @@
-"""What an event is: a function of attitude, rates and time that crosses zero."""
+"""The event: a zero crossing of a function of attitude, rates and time."""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,15 +22,15 @@ class Event(eqx.Module):
     """A zero crossing of ``fn(wxyz, omega_body, t)``, a number of one body at one time.
 
     **Arguments:** ``fn``: of the unit quaternion (4,) body -> space (of either sign), the body
-    rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
+    rates (3,) [rad/s] and the time () [s], smooth; it is mapped over batches. ``direction``: 1
     where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: number of
     equally spaced times at which a motion in closed form is sampled; None: 32 per revolution of the
     fastest natural rate (see ``ph.crossings``). Under ``jit``, ``crossings`` of a motion in closed
     form needs it. In a simulation (``simulate(..., events=)``): ``terminal``: whether a body stops
     at the event; ``capacity``: number of events of a body that are stored.
 
-    Raises TypeError or ValueError for a function that takes or returns something else, another
-    direction, fewer than two samples, or no capacity.
+    Raises TypeError or ValueError for a function with other arguments or results, another
+    direction, fewer than two samples, or a capacity below one.
 
         horizontal = ph.Event(lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, z)[2])
     """
@@ -63,8 +63,8 @@ class Event(eqx.Module):
     def values(
         self, trajectory: Trajectory, rates: list[Array] | None = None
     ) -> tuple[Array, Array]:
-        """The function and its rate of change [1/s] at every sample (..., T); ``rates``: those of
-        the samples, where they are known."""
+        """The function and its rate of change [1/s] at every sample (..., T); ``rates``: rates of
+        the samples, if they have been computed."""
         wxyz, omega = trajectory.wxyz, trajectory.omega_body
         t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
         if rates is None:
@@ -77,7 +77,8 @@ class Event(eqx.Module):
         self, approximate: Trajectory, limit: Array, side: Array
     ) -> tuple[Array, Trajectory]:
         """``refined`` for samples at which the function is zero to rounding: the same derivatives,
-        and no computation where none is needed. ``side`` (..., T): sign of the function before."""
+        computed only if derivatives are requested. ``side`` (..., T): sign of the function
+        before."""
         arrays, static = eqx.partition(approximate, eqx.is_inexact_array)
 
         def values_of(arrays, limit, side):
@@ -97,11 +98,12 @@ class Event(eqx.Module):
         """Samples moved to the events next to them.
 
         ``approximate``: samples (..., T) near events; ``limit`` [s]: the longest move. Returns the
-        moves (..., T) [s], and the samples at the events. ``side``: where the rates may jump at the
-        event, the sign of the function before it, whose rates lead there.
+        moves (..., T) [s], and the samples at the events. ``side``: the sign of the function before
+        the event, if the rates may jump there: the rates of that side are used.
 
-        Steps t - g(t)/s with one constant s, the rate of change of g: where g(t) is zero they
-        change nothing, and after two of them t has the first and second derivatives of the root.
+        Two steps t - g(t)/s of Newton's method with the same constant s, the rate of change of g.
+        Where g(t) is zero they do not change t, but after two of them t has the first and second
+        derivatives of the root.
         """
         stop_gradient = jax.lax.stop_gradient
         shift = None if side is None else self._towards(approximate, side)
@@ -117,8 +119,8 @@ class Event(eqx.Module):
         return delay, later(delay)
 
     def _towards(self, trajectory: Trajectory, side: Array) -> list[Array]:
-        """Changes of attitude, rates and time by some units in the last place, which lead from the
-        surface where the function is zero to the ``side`` where it has this sign."""
+        """Changes of attitude, rates and time by some units in the last place, from the surface
+        where the function is zero to the side where it has the sign ``side``."""
         wxyz, omega, t = jax.lax.stop_gradient(
             (trajectory.wxyz, trajectory.omega_body, jnp.asarray(trajectory._t))
         )
@@ -143,15 +145,15 @@ class Event(eqx.Module):
 
 
 _TOWARDS = 256
-"""[units in the last place] How far from the surface of an event rates are evaluated where a torque
-may jump there; it is found to some of them."""
+"""[eps] Distance from the surface of an event at which rates are evaluated, since a torque may jump
+at the surface. The event itself is located to a few eps."""
 
 
 def _differentiable(x: Array, order: int) -> Array:
-    """``x``, whose derivatives beyond ``order`` are refused while they are traced.
+    """``x``, whose derivatives beyond ``order`` raise NotImplementedError while they are traced.
 
-    Each differentiation around another passes the rule below once, in whatever mode: reverse mode
-    transposes what this rule returns.
+    Each nested differentiation applies the rule below once, in either mode, because reverse mode
+    transposes the result of the rule.
     """
 
     @jax.custom_jvp
@@ -162,9 +164,8 @@ def _differentiable(x: Array, order: int) -> Array:
     def derivative(primals, tangents):
         if order == 0:
             raise NotImplementedError(
-                "event times and states at events have first and second derivatives, and a third"
-                " one was asked for: differentiate twice at most, or take differences of second"
-                " derivatives."
+                "event times and states at events have first and second derivatives only: a third"
+                " derivative needs finite differences of the second."
             )
         return _differentiable(primals[0], order - 1), tangents[0]
 

@@ -1,8 +1,9 @@
-"""Zeros of functions of a motion that is known at every time.
+"""Zeros of functions of a motion that can be evaluated at any time.
 
-A motion in closed form takes long to compile, so a search contains it once: the samples, the
-turning points between them, the roots, and the bodies at these are passes of one loop, which looks
-at the motion at some times and decides by what it finds where to look next.
+A motion in closed form takes long to compile, so that the program of a search contains it once. The
+samples, the turning points between them, the roots, and the states at the roots are passes of one
+loop. Each iteration evaluates the motion at some times, and the results determine the next times.
+One such evaluation is called a *look* in names.
 """
 
 from collections.abc import Callable
@@ -18,12 +19,12 @@ _SAMPLES, _TURNS, _ROOTS, _STATES = range(4)
 """The passes of the loop."""
 
 _MAX_LOOKS = 100
-"""Looks for one root: halving alone would need about sixty."""
+"""Maximum number of evaluations for one root: bisection alone would need about sixty."""
 
 
 class Looks(NamedTuple):
-    """N bodies at times (N, W): values and slopes (E, N, W) of E functions, states (N, W, ...), and
-    which bodies (N,) the method could move."""
+    """N bodies at times (N, W): values and time derivatives (``slopes``) (E, N, W) of E functions,
+    states (N, W, ...), and whether the motion of each body (N,) was computed successfully."""
 
     values: Array
     slopes: Array
@@ -32,7 +33,8 @@ class Looks(NamedTuple):
 
 
 class Brackets(NamedTuple):
-    """Times (E N, K) before and after zeros of a function, its values there, and which are used."""
+    """Times (E N, K) before and after zeros of a function, its values there, and which entries are
+    used."""
 
     low: Array
     high: Array
@@ -42,8 +44,8 @@ class Brackets(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Samples; roots (E N, K), which entries are used, and what ``brackets`` returned beside them;
-    the slopes there, and the states (E N, K, ...)."""
+    """Samples; roots (E N, K), which entries are used, and the second result of ``brackets``; time
+    derivatives at the roots, and the states (E N, K, ...)."""
 
     samples: Looks
     roots: Array
@@ -66,12 +68,14 @@ def searched(
 ) -> Found:
     """Samples at the times ``grid`` (N, S), and the roots between them.
 
-    ``look``: the motion at times (N, W), of which there are ``width`` or more, E K at least.
-    ``turns(samples, analysis)``: where slopes vanish; ``brackets(samples, analysis, turns,
-    turning_values)``: where values do, given these turning points, and anything else; both with
-    K = ``columns`` entries. ``analysis``: that of all samples, which is made once. ``samples``:
-    those at ``grid``, where they are known without ``look``; ``keep``: whether they hold their
-    states.
+    - ``look``: evaluates the motion at times (N, W), W = ``width`` or more, and at least E K.
+    - ``analyse(samples)``: the analysis of all samples, made once.
+    - ``turns(samples, analysis)``: brackets of the zeros of the time derivatives.
+    - ``brackets(samples, analysis, turning, turning_values)``: brackets of the zeros of the
+      functions, for these turning points and the values there, and any other result. Both return
+      K = ``columns`` entries.
+    - ``samples``: those at ``grid``, if they are available without ``look``.
+    - ``keep``: whether the samples include the states.
     """
     (n, size), is_sampled = grid.shape, samples is not None
     blank = _blank(look, jnp.broadcast_to(grid[:, :1], (n, width)))
@@ -86,7 +90,8 @@ def searched(
         return jnp.pad(t, ((0, 0), (0, width - rows * columns)), mode="edge")
 
     def of_rows(x):
-        """Every function at the times of all rows (E, N, W, ...) -> at those of its own row."""
+        """From every function at the times of all rows (E, N, W, ...) to each at those of its own
+        row (E N, K, ...)."""
         x = x[:, :, : rows * columns].reshape(rows, n, rows, columns, *x.shape[3:])
         own = jnp.stack([x[k, :, k] for k in range(rows)])
         return own.reshape(rows * n, columns, *x.shape[4:])
@@ -140,12 +145,12 @@ def searched(
 
 
 def _blank(function: Callable, argument: Any) -> Any:
-    """Ones in the place of what the function returns."""
+    """Ones with the shapes and dtypes of the function's results."""
     return jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), jax.eval_shape(function, argument))
 
 
 def _repeated(looks: Looks, count: int, keep: bool) -> Looks:
-    """Room for so many looks one after the other."""
+    """Arrays to store the results of ``count`` evaluations one after another."""
     values, slopes = (jnp.tile(x, (1, 1, count)) for x in (looks.values, looks.slopes))
     states = [jnp.tile(x, (1, count, 1)) for x in looks.states] if keep else []
     return Looks(values, slopes, states, looks.is_successful)
@@ -157,7 +162,7 @@ def _cut(store: Looks, size: int) -> Looks:
 
 
 def _written(store: Looks, seen: Looks, start: Array, is_sampling: Array) -> Looks:
-    """The samples with what was seen from the sample ``start`` on, if this is the first pass."""
+    """The samples with the new ones stored from index ``start`` on, if this is the first pass."""
 
     def put(old, new, axis):
         there = jax.lax.dynamic_slice_in_dim(old, start, new.shape[axis], axis)
@@ -173,9 +178,8 @@ def _written(store: Looks, seen: Looks, start: Array, is_sampling: Array) -> Loo
 
 
 class _Walk(NamedTuple):
-    """On the way to a root between two times, the first of which was looked at last: these times,
-    the function there, the time to look at next, how near the root must be, and a value that was
-    seen with the last."""
+    """The search for a root between the times ``x1``, evaluated last, and ``x2``: the function
+    there, the next time to evaluate, the tolerance, and another value at the last time."""
 
     is_done: Array
     x1: Array
@@ -197,9 +201,9 @@ def _walk_between(low: Array, high: Array, at_low: Array, at_high: Array, use: A
 
 
 def _next(walk: _Walk, f: Array, value: Array) -> _Walk:
-    """After a look at ``walk.next``, where the function is ``f``.
+    """The search after an evaluation at ``walk.next``, where the function is ``f``.
 
-    Inverse quadratic interpolation where it is safe, halving elsewhere: T. R. Chandrupatla, Adv.
+    Inverse quadratic interpolation where it is safe, bisection elsewhere: T. R. Chandrupatla, Adv.
     Eng. Software 28 (1997) 145; to a few units in the last place of the larger time.
     """
     is_done, x1, x2, f1, f2, x, tolerance, _ = walk
@@ -227,9 +231,11 @@ def _root(walk: _Walk) -> Array:
 
 
 def minima_of(grid, values, slopes, sides) -> Array:
-    """Between which samples (N, S - 1) the function turns back before zero, and comes near it.
+    """Intervals between samples (N, S - 1) in which the function turns back before zero, close to
+    it.
 
-    Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
+    Whether it is close follows from the cubic through the values and derivatives at both samples.
+    The error of the cubic is a hundredth of the change of the function.
     """
     step = grid[:, 1:] - grid[:, :-1]
     side = sides[:, :-1].astype(values.dtype)
@@ -251,7 +257,7 @@ def entries(x: Array, k: Array) -> Array:
 
 
 def first_true(mask: Array, capacity: int) -> tuple[Array, Array]:
-    """Places (N, capacity) of the first that are true, and which of these there are."""
+    """Indices (N, capacity) of the first true entries, and which of these exist."""
     size = mask.shape[-1]
     places = jnp.where(mask, jnp.arange(size), size)
     if capacity > size:

@@ -1,8 +1,8 @@
 """Simulations with events: times and states of all events, and motions that stop at one.
 
-Where the steps do not search for events themselves, a motion that stops is computed in windows, one
-after the other, until each body has met its event: the work follows from where the events are and
-not from the last time.
+If the method does not search for events itself, a motion that stops is computed in windows, one
+after another, until each body has reached its event: the work depends on the times of the events
+and not on the last time.
 """
 
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ from polhode._trajectory import (
 
 
 def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Event, ...]:
-    """``events`` as a tuple; raises TypeError or ValueError for what cannot be searched for."""
+    """``events`` as a tuple; raises TypeError or ValueError if they cannot be searched for."""
     is_several = isinstance(events, (list, tuple))
     all_events = tuple(events) if is_several else (events,)
     for event in all_events:
@@ -64,8 +64,8 @@ def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Even
 
 
 def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Trajectory | None:
-    """The motion from ``begin``, its state at the first of ``ts``, and the events that the
-    integration meets; None where the method does not search for events."""
+    """The motion from ``begin``, its state at the first of ``ts``, and the events located during
+    the integration; None if the method does not search for events."""
     batch, propagator = begin.batch_shape, cast(Propagator, begin.propagator)
     method: Any = propagator.method
     if method.exact:
@@ -117,7 +117,7 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
         Status.TOO_MANY_EVENTS,
         samples.status,
     )
-    bad_input = begin.status.reshape(-1)  # known before the motion: times, moments
+    bad_input = begin.status.reshape(-1)  # invalid times or moments, found before the motion
     status = jnp.where(bad_input == Status.SUCCESSFUL, status, bad_input)
     path = [x[:, :count] for x in (samples.wxyz, samples.omega_body)]
     path += [] if samples.spins is None else [samples.spins[:, :count]]
@@ -137,7 +137,7 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
 
 
 def events_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Trajectory:
-    """The same for a motion that is known at every time: its trajectory is searched."""
+    """The same for methods that do not search for events themselves: by samples of a trajectory."""
     capacity = sum(event.capacity for event in events)  # each may need all of it
     return _in_order_of_time(trajectory, all_crossings(trajectory, events, capacity), events)
 
@@ -152,7 +152,7 @@ def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event])
     at, which = (
         jnp.concatenate([y.reshape(rows.shape[0], -1) for y in x], axis=1) for x in (times, which)
     )
-    capacity = at.shape[1] // len(events)  # of each, for it may need all of it
+    capacity = at.shape[1] // len(events)  # the total for each: all events may be of one kind
     states = [
         jnp.concatenate([y.reshape(rows.shape[0], -1, y.shape[-1]) for y in x], axis=1)
         for x in zip(*met.states)
@@ -160,20 +160,20 @@ def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event])
     order = jnp.argsort(jnp.where(jnp.isfinite(at), sign * at, jnp.inf), axis=1)
     at, which = (jnp.take_along_axis(x, order, axis=1) for x in (at, which))
     states = [jnp.take_along_axis(x, order[..., None], axis=1) for x in states]
-    # what lies beyond a terminal event does not happen
+    # events after a terminal event are dropped
     is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
     stop = jnp.min(jnp.where(is_terminal, sign * at, jnp.inf), axis=1, keepdims=True)
     at = jnp.where(sign * at > stop, jnp.inf, at)
     happens = jnp.isfinite(at)
     count = jnp.sum(happens, axis=1, dtype=jnp.int32)
     for k, (found, total) in enumerate(zip(times, counts, strict=True)):
-        # those that were not listed come after the listed ones
+        # events that were not stored come after the stored ones
         listed = jnp.sum(jnp.isfinite(found.reshape(-1, capacity)), axis=1, dtype=count.dtype)
         all_happen = jnp.sum(happens & (which == k), axis=1, dtype=count.dtype) == listed
         more = jnp.ravel(total).astype(count.dtype) - listed
         count = count + jnp.where(all_happen, jnp.maximum(more, 0), 0)
     overflows = (count > capacity).reshape(batch)
-    # a terminal event is stored in any case, for it is where the motion ends
+    # a terminal event is always stored: it is the end of the motion
     end = jnp.where(jnp.any(is_terminal, axis=1), jnp.argmax(is_terminal, axis=1), 0)
     stored = jnp.broadcast_to(jnp.arange(capacity), (at.shape[0], capacity))
     stored = stored.at[:, -1].max(end)
@@ -201,7 +201,7 @@ def _is_terminal(which: Array, events: Sequence[Event]) -> Array:
 
 
 def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences, states):
-    """Samples beyond a terminal event are those of the event."""
+    """The trajectory with its events; samples after a terminal event are those of the event."""
     batch = begin.batch_shape
     at, which, count = occurrences
     happens = jnp.isfinite(at)
@@ -243,38 +243,39 @@ def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences,
 
 
 _SAMPLES = 64
-"""Steps between samples in a window: two turns of the fastest body."""
+"""Intervals between samples in a window: two revolutions of the fastest body."""
 
 _FIRST, _GROWTH = 2**-10, 4.0
-"""Part of the whole that the first window is at most, and how much longer the next may be: a body
-that rests at first may be set in motion soon."""
+"""Maximum length of the first window, as a part of the time span, and maximum ratio of the lengths
+of successive windows: a body that is at rest at first may be set in motion soon."""
 
 _MAX_SPEED_UP = 1.5
-"""How much faster than at its start a body may turn within a window."""
+"""Maximum ratio of the angular rate of a body within a window to that at its start."""
 
 _MAX_WINDOWS = 2**20
-"""Windows, of a thousandth of a second or less each: what has no event by then is given up."""
+"""Maximum number of windows; a body without an event by then has failed."""
 
 _MINIMA = 2
-"""Places in a window, of each body, where the function may turn back before zero."""
+"""Number of intervals in a window, for each body, in which a turning point of the function close to
+zero is examined."""
 
 
 def check_until(until: Any, record: Any) -> None:
-    """An event, with samples of both attitude and rates."""
+    """Check that ``until`` is an event, and that attitude and rates are recorded at all times."""
     if not isinstance(until, Event):
         raise TypeError(
             f"until must be a ph.Event, got {type(until).__name__}: ph.Event(fn, direction)."
         )
     if record is not None and record.of_states != Record():
         raise ValueError(
-            "until= needs attitude and rates at all times and knows no work and error: leave"
-            " record= out."
+            "until= needs attitude and rates at all times and computes neither work nor error:"
+            " leave record= out."
         )
 
 
 def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
-    """The motion from ``begin``, its state at the first of ``ts``, each body in the state
-    of its first event from then on."""
+    """The motion from ``begin``, its state at the first of ``ts``; from its first event on, each
+    body is in the state of the event."""
     terminal = Event(until.fn, until.direction, until.samples, terminal=True, capacity=1)
     trajectory = events_by_steps(begin, ts, (terminal,))
     if trajectory is not None:
@@ -289,7 +290,7 @@ def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
 
 
 def _stopped_by_windows(lanes: Trajectory, ts: Array, until: Event):
-    """By samples at windows of the motion: samples, status, steps, times and event times, with the
+    """By samples in windows of the motion: samples, status, steps, times and event times, with the
     derivatives of the motion."""
     arrays, static = eqx.partition((lanes, until), eqx.is_inexact_array)
     stop_gradient = jax.lax.stop_gradient
@@ -302,7 +303,7 @@ def _stopped_by_windows(lanes: Trajectory, ts: Array, until: Event):
 
 
 def _of_lanes(begin: Trajectory) -> Trajectory:
-    """The same with one batch axis."""
+    """The trajectory with one batch axis."""
     batch = begin.batch_shape
     n = begin.status.size
     parts = {name: flatten(getattr(begin.scene, name), batch) for name in PARTS}
@@ -324,8 +325,8 @@ def _of_lanes(begin: Trajectory) -> Trajectory:
 
 
 class _Minimum(NamedTuple):
-    """Where a function that keeps its sign at the samples crosses zero and turns back: after which
-    look (N,), ``_SAMPLES`` for nowhere; when it turns, its value there and its sign before."""
+    """The first turning point beyond zero between two samples of equal sign: the index of the
+    interval (N,), ``_SAMPLES`` if there is none; its time, the value there and the sign before."""
 
     place: Array
     time: Array
@@ -334,7 +335,8 @@ class _Minimum(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """The search under way: the next window begins at ``share`` of the whole, with ``samples``."""
+    """Carry of the search. ``share``: part of the time span at which the next window begins;
+    ``width``: length of that window; ``samples``: the states there."""
 
     count: Array
     share: Array
@@ -346,8 +348,8 @@ class _Window(NamedTuple):
 
 
 def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...]:
-    """Which bodies (N,) meet their event, and which were given up; when it is, and the time
-    between two samples there [s]."""
+    """Which bodies (N,) have an event, which have failed because the windows ran out, the times of
+    the events, and the interval between two samples there [s]."""
     propagator: Any = lanes.propagator
     exact = propagator.method.exact
     start_time, end_time = ts[..., 0], ts[..., -1]
@@ -357,13 +359,14 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
     min_width = 4 * _SAMPLES * float(jnp.finfo(dtype).eps)
 
     def times(share):
-        """(K,) or (N, K) of parts (K,) of the whole."""
+        """Times (K,) or (N, K) at the parts ``share`` (K,) of the time span."""
         share = share.reshape((1,) * span.ndim + share.shape)
         grid = start_time[..., None] + share * span[..., None]
         return jnp.where(share >= 1, end_time[..., None], grid)
 
     def at(time, samples, share_of_error=None):
-        """The bodies at a time () or (N,), one sample each."""
+        """A trajectory of one sample at a time () or (N,). ``share_of_error``: part of ``rtol``
+        for the motion from there on."""
         wxyz, omega, *spins = (x[:, None] for x in samples)
         limited_propagator = propagator
         if share_of_error is not None and propagator.rtol is not None:
@@ -412,8 +415,9 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             return Looks(values[None], slopes[None], moved._samples, is_successful)
 
         def analyse(seen: Looks):
-            """The first change of sign (N,), where the function turns back, and how far the samples
-            reach: up to where a body turns too fast for them, or a minimum is left out.
+            """The first change of sign (N,), the turning points, and the index up to which the
+            samples are valid: to where a body rotates too fast for them, or to a turning point
+            beyond the number that is examined.
             """
             values, slopes = seen.values[0], seen.slopes[0]
             sides = jnp.where(values >= 0, 1, -1)
@@ -448,7 +452,8 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             return Brackets(low, high, at_low, at_high, is_minimum)
 
         def brackets(seen: Looks, analysis, turning, turning_values):
-            """The event in the first of the columns; which bodies have one, and the reach."""
+            """A bracket of the event in the first column; which bodies have one, and the index up
+            to which the samples are valid."""
             sides, change, place, is_minimum, reach = analysis
             minimum = _first_minimum(turning, turning_values, sides, place, is_minimum)
             is_new = busy & (jnp.minimum(minimum.place, change) < reach)
@@ -501,7 +506,8 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
 
 
 def _first_minimum(time, value, sides, place, is_minimum) -> _Minimum:
-    """Of the turning points (N, D) after the samples ``place``, the first beyond zero."""
+    """The first of the turning points (N, D), in the intervals ``place``, at which the function has
+    crossed zero."""
     side = entries(sides, place)
     across = is_minimum & (jnp.where(value >= 0, 1, -1) != side)
     pair, exists = first_true(across, 1)
@@ -512,11 +518,11 @@ def _first_minimum(time, value, sides, place, is_minimum) -> _Minimum:
 
 
 def _bracket(grid, values, change, minimum: _Minimum, direction, is_new) -> tuple[Array, ...]:
-    """Two times (N,) around the first event, a change of sign between two samples or a minimum,
-    and the values there; ``direction`` (N,): in the order of the samples, 0 for any. Entries that
-    are not ``is_new`` are arbitrary."""
+    """Two times (N,) around the first event, between two samples or between a sample and a turning
+    point, and the values there; ``direction`` (N,): in the order of the samples, 0 for any. Entries
+    that are not ``is_new`` are arbitrary."""
     interval = jnp.where(is_new, jnp.minimum(minimum.place, change), 0)[:, None]
-    # of the pair of crossings at a minimum the second, where the first has the other direction
+    # the second of the two crossings around a turning point, if the first has the other direction
     is_second = (direction != 0) & (jnp.where(minimum.side < 0, 1, -1) != direction)
     is_minimum = minimum.place < change
     ends_at_minimum, starts_at_minimum = is_minimum & ~is_second, is_minimum & is_second
@@ -544,7 +550,7 @@ def _stopped_at(
         near_event = states[..., -1:]
     else:
         near_event = moved_to(states, jnp.where(has_event, event_time, ts[..., 0])[:, None])
-    # the motion in windows differed from this one by no more than the tolerance allows
+    # the motion in windows differs from this one within the tolerance
     limit = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near_event._t)
     propagator: Any = lanes.propagator
     if not propagator.method.exact:

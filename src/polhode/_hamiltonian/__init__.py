@@ -1,4 +1,4 @@
-"""The one Hamiltonian, its two sets of coordinates, and closed forms to compare with."""
+"""The Hamiltonian, its two sets of coordinates, and closed forms as a reference for tests."""
 
 from polhode._hamiltonian._energy import (
     Attitude as Attitude,

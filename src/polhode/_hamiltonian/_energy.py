@@ -1,8 +1,8 @@
-"""The Hamiltonian of the rigid body, written once, and the attitude that a potential sees.
+"""The Hamiltonian of the rigid body, and the attitude as the argument of a potential.
 
-Whatever is integrated is a derivative of H. Both coordinates (ZYZ Euler angles; quaternion and body
-momentum) and every energy that the library reports evaluate ``Hamiltonian.__call__``; nothing else
-in the package states the formula.
+All integrated equations of motion are derivatives of H. Both sets of coordinates (ZYZ Euler angles;
+quaternion and body momentum) and every energy that the library reports evaluate
+``Hamiltonian.__call__``, the only place of the formula in the package.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -33,7 +33,8 @@ def cross(a: Sequence[Array], b: Sequence[Array]) -> Vector:
 
 
 def triple(values: Iterable[Array]) -> Vector:
-    """Three component arrays, one after the other, as a tuple of three; ValueError for others."""
+    """The items of an iterable of three component arrays as a tuple; ValueError for another
+    number of items."""
     x, y, z = values
     return x, y, z
 
@@ -46,9 +47,9 @@ def components(array: Array) -> Vector:
 class Attitude:
     """Rotation body -> space by the rows of its matrix R (``x_space = R x_body``).
 
-    Row ``i`` holds the body components of the space axis ``i``. Rows are evaluated when first
-    used and remembered, so that rows on which a potential does not depend cost nothing; ``used``
-    lists the rows used.
+    Row ``i`` contains the body components of the space axis ``i``. Rows are computed when they are
+    first used, and cached, so that rows on which a potential does not depend are not computed;
+    ``used`` lists the rows used.
     """
 
     def __init__(
@@ -127,21 +128,21 @@ def from_euler_angles(phi: Array, theta: Array, psi: Array) -> Attitude:
 
 
 def from_rows(rows: dict[int, Vector]) -> Attitude:
-    """Attitude of rows that are known already."""
+    """Attitude with rows that have been computed."""
     return Attitude(lambda i: rows[i])
 
 
 @runtime_checkable
 class EnergyOfAttitude(Protocol):
-    """What the Hamiltonian needs of a potential (see ``polhode._scene.AbstractPotential``)."""
+    """The interface of a potential that the Hamiltonian uses (``_scene.AbstractPotential``)."""
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array: ...
 
 
 def inverse_components(tensor: Array) -> tuple[Array, ...]:
     """(xx, yy, zz, xy, xz, yz) of the inverse of a symmetric tensor of shape (..., 3, 3)."""
-    # In units of its own trace: the derivative of one over the determinant has the moments to the
-    # sixth power, which in single precision underflows from moments of 1e6 on.
+    # In units of the trace: the derivative of one over the determinant contains one over the sixth
+    # power of the moments, which underflows in single precision for moments of 1e6 and more.
     unit = jax.lax.stop_gradient(tensor[..., 0, 0] + tensor[..., 1, 1] + tensor[..., 2, 2])
     a, b, c = (tensor[..., k, k] / unit for k in range(3))
     d, e, f = (tensor[..., i, j] / unit for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -161,11 +162,11 @@ def inverse_inertia(inertia: Inertia) -> tuple[Array, ...]:
 class Hamiltonian(eqx.Module):
     """H = (L - h) . I^-1 (L - h) / 2 + V(R, t), in joules (docs/equations.md, 000: 1).
 
-    **Fields:** ``inverse`` entries of I^-1 (three or six component arrays), or a function of the
-    time that returns them, where the inertia changes; ``inertia`` handed on
-    to the potential, ``potential`` or None, ``rotor_momentum`` or None: h(t) [kg m^2/s], body
-    components of the momentum that wheels carry relative to the body, ``wheel_energy`` or None:
-    energy [J] of their turning about their axes, a function of time alone that moves nothing.
+    **Fields:** ``inverse``: entries of I^-1 (three or six component arrays), or a function of time
+    that returns them, if the inertia is variable; ``inertia``: an argument of the potential;
+    ``potential`` or None; ``rotor_momentum`` or None: h(t) [kg m^2/s], body components of the
+    momentum that the wheels carry relative to the body; ``wheel_energy`` or None: energy [J] of
+    their rotation about their axes, a function of time alone, which does not affect the motion.
     """
 
     inverse: tuple[Array, ...] | Callable[[Array | float], tuple[Array, ...]]
@@ -195,16 +196,16 @@ class Hamiltonian(eqx.Module):
     def total(
         self, momentum: Sequence[Array], attitude: Attitude | None, t: Array | float
     ) -> Array:
-        """H and the energy of the wheels [J]: what changes by work from outside only."""
+        """H and the energy of the wheels [J]: only external work changes this sum."""
         energy = self(momentum, attitude, t)
         return energy if self.wheel_energy is None else energy + self.wheel_energy(t)
 
     def rows_used(self, attitude: Attitude, t: Array | float) -> tuple[int, ...]:
-        """Rows of R on which the potential depends (by tracing it once; none without one)."""
+        """Rows of R on which the potential depends, from tracing it once; none without one."""
         potential = self.potential
         if potential is None:
             return ()
-        row = jax.eval_shape(lambda: attitude.compute(2))  # not kept: no leak
+        row = jax.eval_shape(lambda: attitude.compute(2))  # not cached: it would leak a tracer
         rows: tuple[int, ...] = ()
 
         def traced_energy(rows_of_attitude):

@@ -1,7 +1,7 @@
-"""The canonical chart (docs/equations.md, 000): ZYZ angles (phi, theta, psi) and their momenta.
+"""Canonical coordinates (docs/equations.md, 000): ZYZ angles (phi, theta, psi) and their momenta.
 
-H(q, p) expresses the body momentum through (q, p) and hands it to the one Hamiltonian;
-Hamilton's equations are its derivatives by ``jax.grad``. The chart needs sin(theta) != 0.
+H(q, p) is the Hamiltonian of ``_energy.py`` with the body momentum as a function of (q, p);
+Hamilton's equations are its derivatives by ``jax.grad``. They require sin(theta) != 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -77,9 +77,9 @@ def hamiltons_equations(
 ) -> Callable[..., tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]]:
     """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (docs/equations.md: 2, 3).
 
-    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes, also those that H adds
-    of its own (a batch of inertias), broadcast, and are allowed as long as H treats them one by
-    one. Lists and integers are taken as arrays of floats.
+    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``. Leading batch axes broadcast, including
+    those that only H has (a batch of inertias); H must treat the entries of a batch separately.
+    Lists and integers are converted to arrays of floats.
     """
 
     def equations(q, p, *args):
@@ -135,7 +135,7 @@ def euler_angle_field(t, y, dynamics: Dynamics):
         rate_p = tuple(a + b for a, b in zip(rate_p, canonical_from_momentum(q, push)))
         momentum = momentum_from_canonical(q, p)
         slip = dynamics.torque.slip(t, momentum, omega)
-        if slip is not None:  # axes that slip past a momentum which rests in space
+        if slip is not None:  # the axes rotate by the slip while the space momentum is constant
             coordinate_rates = angle_rates_from_rates(q, slip), cross(momentum, slip)
             _, momentum_change = jax.jvp(canonical_from_momentum, (q, momentum), coordinate_rates)
             rate_q = tuple(a + b for a, b in zip(rate_q, coordinate_rates[0]))

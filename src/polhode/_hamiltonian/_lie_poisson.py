@@ -2,9 +2,9 @@
 
 dL/dt = L x w + sum_j r_j x dH/dr_j + N,   dq/dt = q (0, w) / 2,   w = dH/dL + s,
 
-r_j the rows of R (body components of the space axes). Both derivatives of H come from one
-``jax.grad``; for V = 0 this is Euler's equation in body axes. The slip s is that of a body which
-loses energy inside (``ph.EnergySink``), else absent.
+where r_j are the rows of R (body components of the space axes). Both derivatives of H come from one
+``jax.grad``; for V = 0 this is Euler's equation in body axes. The slip s is that of a body with
+internal dissipation (``ph.EnergySink``), and zero for all others.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,11 +53,12 @@ def rates_and_torque(
 def external_power(
     t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: "Dynamics"
 ) -> Array:
-    """Power [W] that the energy of body and wheels grows by, on component arrays.
+    """Rate of change [W] of the energy of body and wheels, on component arrays.
 
-    N . omega of the external torque, and the change of H with time itself: a potential that
-    depends on time, an orbit, a wheel turned by its motor (whose power is torque times speed). Less
-    what is lost inside: omega . (L x s), and the potential's torque times the slip s.
+    The power N . omega of the external torque, and the partial derivative of H by time: of a
+    potential that depends on time, an orbit, or a wheel driven by its motor (torque times speed).
+    With internal dissipation also omega . (L x s), and minus the potential's torque times the slip
+    s.
     """
     hamiltonian = dynamics.hamiltonian
     power = jnp.zeros_like(momentum[0])
@@ -76,7 +77,7 @@ def external_power(
         return power
     rows = {i: attitude.row(i) for i in hamiltonian.rows_used(attitude, t)}
     t = jnp.asarray(t, power.dtype)
-    # forwards: one time may be shared by many bodies
+    # forward mode, because many bodies may have the same time
     _, slope = jax.jvp(
         lambda t: hamiltonian.total(momentum, from_rows(rows), t), (t,), (jnp.ones_like(t),)
     )
@@ -86,8 +87,8 @@ def external_power(
 class Dynamics(eqx.Module):
     """The Hamiltonian of a body and the external torque on it (``AbstractTorque`` or None).
 
-    ``wheels``: those that are not all held, or None; the momenta of the ``coupled`` ones are part
-    of the state. ``units(y, rates)``: natural units of the states; None: those of any state.
+    ``wheels``: the wheels, or None if all are held; the momenta of the ``coupled`` ones are part of
+    the state. ``units(y, rates)``: natural units of the states; None: ``GroupUnits``.
     ``costate(dynamics, y, t)`` (static): the adjoint equations; None: those of any field.
     """
 
@@ -99,7 +100,7 @@ class Dynamics(eqx.Module):
 
     @property
     def coupled(self) -> tuple[int, ...]:
-        """Which wheels have momenta that are part of the state (static)."""
+        """Indices of the wheels whose momenta are part of the state (static)."""
         return () if self.wheels is None else self.wheels.coupled
 
     def torque_at(self, t: Array | float) -> Any:
@@ -108,7 +109,7 @@ class Dynamics(eqx.Module):
         return self.torque if carried is None else self.torque.with_wheels(carried(t))
 
     def at(self, spins: Sequence[Array] = ()) -> "Dynamics":
-        """The dynamics at a moment when the coupled wheels have these momenta [kg m^2/s]."""
+        """The dynamics at an instant, for these momenta of the coupled wheels [kg m^2/s]."""
         if not spins:
             return self
         wheels, energy = self.wheels.at(spins), self.hamiltonian
@@ -125,7 +126,7 @@ def motor_powers(
     dynamics: Dynamics,
     which: Sequence[int],
 ) -> list[Array]:
-    """Power [W] that the motors and the friction of these wheels give to the motion."""
+    """Power [W] of the motors and the friction of these wheels."""
     omega, _ = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
     powers = dynamics.wheels.motor_power(t, attitude, omega)
     return [powers[i] for i in which]
@@ -137,13 +138,13 @@ def momentum_rate(
     attitude: Attitude | None,
     dynamics: "Dynamics | Any",
 ) -> tuple[Vector, Vector]:
-    """dL/dt [N m] in body axes and the rates [rad/s] at which these axes turn; no attitude where
-    nothing depends on it."""
+    """dL/dt [N m] in body axes and the angular velocity [rad/s] of these axes; ``attitude``: None
+    if nothing depends on it."""
     return _motion(t, momentum, attitude, dynamics)[:2]
 
 
 def _motion(t, momentum, attitude, dynamics) -> tuple[Vector, Vector, Vector]:
-    """The same, and dH/dL [rad/s]."""
+    """``momentum_rate``, and dH/dL [rad/s]."""
     omega, potential_torque = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
     slip = None if dynamics.torque is None else dynamics.torque.slip(t, momentum, omega)
     axes_rate = omega if slip is None else triple(map(add, omega, slip))
@@ -181,9 +182,9 @@ def spin_rates(
 class LiePoissonUnits(eqx.Module):
     """Natural units of body momentum and quaternion, updated with the state.
 
-    ``size`` (N,): of each inertia [kg m^2]; ``min_momentum`` (N,): unit of momentum
-    [kg m^2/s] of a body at rest, which a torque may move later; ``wheels`` (static): how many have
-    momenta that are part of the state.
+    ``size`` (N,): mean moment of each inertia [kg m^2]; ``min_momentum`` (N,): unit of momentum
+    [kg m^2/s] of a body at rest, which a torque may accelerate later; ``wheels`` (static): number
+    of wheels whose momenta are part of the state.
     """
 
     size: Float[Array, "*n"]
@@ -191,14 +192,15 @@ class LiePoissonUnits(eqx.Module):
     wheels: int = eqx.field(static=True, default=0)
 
     def __call__(self, y: Sequence[Array], rates: Sequence[Array]) -> tuple[list[Array], Array]:
-        """Weights of the components, their squares to be summed (rad), and the rate [rad/s]."""
+        """Weights of the components, for the root of the sum of squares [rad], and the natural rate
+        [rad/s]."""
         torque = jnp.sqrt(sum(x * x for x in rates[:3]))
         carried = [*y[:3], *y[7 : 7 + self.wheels]]
         unit = jnp.sqrt(sum(x * x for x in carried) + self.min_momentum**2 + 3 * self.size * torque)
         axes_rate = 4 * sum(x * x for x in rates[3:7])  # the square of the body rates
         others = [jnp.zeros_like(unit)] * (
             len(y) - 7 - self.wheels
-        )  # the work follows from the others
+        )  # the work has no weight: its error follows from those of the others
         spins = [1 / unit] * self.wheels
         weights = [1 / unit] * 3 + [jnp.full_like(unit, 2)] * 4 + spins + others
         return weights, jnp.sqrt(axes_rate + torque / self.size)
@@ -214,14 +216,14 @@ class FixedUnits(eqx.Module):
         rate = jnp.sqrt(sum((w * x) ** 2 for w, x in zip(self.weights, rates)))
         others = [jnp.zeros_like(rate)] * (
             len(y) - len(self.weights)
-        )  # the work, where it is recorded
+        )  # the work, if it is recorded
         return [*self.weights, *others], rate
 
 
 def relative(
     weights: Sequence[Array], change: Sequence[Array], rates: Sequence[Array], rate: Array
 ) -> list[Array]:
-    """Weights that measure a variation by its own size, and by its growth within one radian."""
+    """Weights that scale errors of a variation by its size and its growth within one radian."""
     square = sum((w * x) ** 2 for w, x in zip(weights, change))
     rate_square = sum((w * x) ** 2 for w, x in zip(weights, rates))
     square = square + rate_square / jnp.where(rate > 0, rate, 1) ** 2
@@ -237,19 +239,20 @@ def relative(
 # K = a . (L x dH/dL + sum_j r_j x dH/dr_j + N) + m . dH/dL,
 # da/dt = -dK/dL,   dm/dt = m x dH/dL - (derivative of K by a rotation eta),
 #
-# and the derivative of the result by a parameter p is the integral of dK/dp. Of the attitude only
-# the rows that H and N depend on are integrated. L. S. Pontryagin et al., The Mathematical Theory
-# of Optimal Processes (1962), chapter 1; on the group: A. A. Agrachev, Y. L. Sachkov, Control
-# Theory from the Geometric Viewpoint (2004), section 18.2.
+# and the derivative of the result by a parameter p is the integral of dK/dp. If H and N depend on
+# one row of R only, this row is integrated instead of the quaternion. L. S. Pontryagin et al., The
+# Mathematical Theory of Optimal Processes (1962), chapter 1; on the group: A. A. Agrachev, Y. L.
+# Sachkov, Control Theory from the Geometric Viewpoint (2004), section 18.2.
 
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class LiePoissonCostate(NamedTuple):
-    """The equations for ``ph.FlowAdjoint``; ``row``: the only row of R that matters, or None.
+    """The equations for ``ph.FlowAdjoint``; ``row``: the only row of R on which the motion depends,
+    or None.
 
-    The motion conserves the quaternion's length: a cotangent along it is returned unchanged.
+    The motion conserves the norm of the quaternion: a cotangent along it is returned unchanged.
     """
 
     row: int | None
@@ -262,14 +265,14 @@ class LiePoissonCostate(NamedTuple):
         return cls(rows[0] if one_row else None)
 
     def begin(self, y, cotangents):
-        """State to integrate backwards, (L, attitude, a, m), of the end and its cotangents."""
+        """The variables (L, attitude, a, m) at the end, from its state and cotangents."""
         momentum, wxyz = y
         turn = tuple(dot(cotangents[1], quaternion_rate(wxyz, axis)) for axis in _AXES)
         place = wxyz if self.row is None else from_quaternion(wxyz).row(self.row)
         return tuple(momentum), tuple(place), tuple(cotangents[0]), turn
 
     def rates(self, t, z, dynamics):
-        """Rates of this state and K."""
+        """Rates of these variables, and K."""
         momentum, place, by_momentum, turn = z
 
         def pairing(momentum, place):
@@ -290,16 +293,16 @@ class LiePoissonCostate(NamedTuple):
     def finish(self, z, start, end, cotangents):
         """Cotangents of the initial state; ``cotangents``: those of the state at its ``end``."""
         _, place, by_momentum, turn = z
-        wxyz = place if self.row is None else start[1]  # not integrated back: the start is known
+        wxyz = place if self.row is None else start[1]  # the quaternion itself is not integrated
         along_wxyz = dot(cotangents[1], end[1])
         by_wxyz = quaternion_rate(wxyz, tuple(4 * x for x in turn))
         return by_momentum, tuple(a + along_wxyz * q for a, q in zip(by_wxyz, wxyz))
 
     def units(self, weights_of_state, z, rates):
-        """Weights of the components of the state integrated backwards, and the natural rate."""
+        """Weights of the variables integrated backwards, and the natural rate."""
         (momentum, place, by_momentum, turn), (momentum_rates, place_rate, *cotangents) = z, rates
         padding = (place[0],) * (4 - len(place))
-        if padding:  # a row turns by the whole angle, a quaternion by half of it
+        if padding:  # a row rotates by the full angle, a quaternion by half of it
             place_rate = tuple(x / 2 for x in place_rate)
         y = (*momentum, *place, *padding)
         state_rates = (*momentum_rates, *place_rate, *(jnp.zeros_like(x) for x in padding))

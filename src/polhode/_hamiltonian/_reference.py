@@ -1,7 +1,7 @@
 """Closed forms to compare with: the ZYZ Euler-angle Hamiltonian and the axis-angle conversion.
 
-Independent references for what ``jax.grad`` and ``polhode.rotation`` must give; nothing here moves
-a body. Equation numbers are those of docs/equations.md; misprints are corrected there.
+Independent references for results of ``jax.grad`` and ``polhode.rotation``; they are not used in
+simulations. Equation numbers are those of docs/equations.md; misprints are corrected there.
 
 The Euler-angle Hamiltonian (000). Arrays: ``moments`` (..., 3) principal moments [kg m^2],
 ``q`` (..., 3) = (phi, theta, psi) [rad], ``p`` (..., 3) momenta, ``qd`` (..., 3) angle rates;
@@ -9,9 +9,8 @@ all broadcast.
 
 The matrix K and the axis-angle formulas (002), as printed: arccos and the quotients lose accuracy
 near the identity and near half turns; ``ph.rotation.euler_to_axis_angle`` is the robust form. K is
-the attitude R of the same angles seen in axes with y and z reversed, ``K = D R D`` with
-``D = diag(1, -1, -1)``; so K turns by the same angle as R about ``(l, -m, -n)`` when R turns about
-``(l, m, n)``.
+the attitude R of the same angles in axes with y and z reversed, ``K = D R D`` with ``D = diag(1,
+-1, -1)``: if R is a rotation about ``(l, m, n)``, K is one by the same angle about ``(l, -m, -n)``.
 """
 
 from typing import NamedTuple
@@ -61,7 +60,7 @@ def gamma(moments: Vector3, q: Vector3) -> Float[Array, "*b"]:
 
 
 def energy(moments: Vector3, q: Vector3, p: Vector3) -> Float[Array, "*b"]:
-    """Eq. 1 by way of eq. 11: p . V p / 2 [J]."""
+    """Eq. 1 in the form of eq. 11: p . V p / 2 [J]."""
     return quadratic(inverse_mass_matrix(moments, q), p) / 2
 
 
@@ -262,7 +261,7 @@ def _matrix(rows: list[list[Array]]) -> Float[Array, "*b 3 3"]:
 
 
 def matrix_k(phi: _Angle, theta: _Angle, psi: _Angle) -> Float[Array, "*b 3 3"]:
-    """K, product of three passive turns, ``Rz(phi)^T Ry(theta)^T Rz(psi)^T`` (eq. 1)."""
+    """K, product of three passive rotations, ``Rz(phi)^T Ry(theta)^T Rz(psi)^T`` (eq. 1)."""
     cp, sp, ct, st = jnp.cos(phi), jnp.sin(phi), jnp.cos(theta), jnp.sin(theta)
     c, s = jnp.cos(psi), jnp.sin(psi)
     return _matrix(
@@ -275,7 +274,7 @@ def matrix_k(phi: _Angle, theta: _Angle, psi: _Angle) -> Float[Array, "*b 3 3"]:
 
 
 def axis_angle_matrix(axis: _Triple, angle: _Angle) -> Float[Array, "*b 3 3"]:
-    """Active turn by ``angle`` about the unit axis (l, m, n) (eq. 2)."""
+    """Active rotation by ``angle`` about the unit axis (l, m, n) (eq. 2)."""
     l, m, n = axis
     c, s = jnp.cos(angle), jnp.sin(angle)
     return _matrix(

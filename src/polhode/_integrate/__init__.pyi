@@ -1,4 +1,5 @@
-"""Names of the integrators, imported at first use: diffrax loads with the first of them."""
+"""Names of the integrators, imported at first use so that ``import polhode`` does not load
+diffrax."""
 
 from ._charts import (
     EulerChart as EulerChart,

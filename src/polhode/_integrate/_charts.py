@@ -1,6 +1,7 @@
-"""The two charts of the one H: what a state is made of, and its vector field.
+"""The two coordinate systems (*charts*) of the equations of motion: Lie-Poisson and Euler angles.
 
-The field is that of one body, written on components; bodies are the entries of their arrays.
+A chart defines the state and its vector field, which is derived from the same Hamiltonian. The
+field is that of one body, written in components; bodies are the entries of these arrays.
 """
 
 import abc
@@ -46,11 +47,10 @@ from polhode.rotation import euler_to_wxyz, wxyz_to_euler
 
 
 class AbstractChart(eqx.Module):
-    """Base of the charts. A state is two groups of component arrays (N,).
+    """Base of the charts. A state is two groups of component arrays (N,); with coupled wheels a
+    third group contains the momenta of the wheels.
 
-    With coupled wheels a third: their momenta.
-
-    ``canonical``: whether these are coordinates and their momenta.
+    ``canonical``: whether the two groups are coordinates and their conjugate momenta.
     """
 
     canonical: ClassVar[bool] = False
@@ -65,23 +65,23 @@ class AbstractChart(eqx.Module):
 
     @abc.abstractmethod
     def dynamics(self, scene: Scene, state: State, ts: Array) -> Dynamics:
-        """What moves the lanes, with the natural units of their states."""
+        """Hamiltonian, torques and wheels of the lanes, with the natural units of their states."""
 
     @abc.abstractmethod
     def start(self, scene: Scene, state: State, t: Array) -> tuple[PyTree[Array], Array]:
-        """Initial state of lanes, and which of them the chart can hold.
+        """Initial state of lanes, and which of them the chart can represent.
 
-        A lane that it cannot hold starts from some sound state instead, so that it does not hold
-        up the others; its samples are NaN and its status says why.
+        A lane that it cannot represent starts from a regular state instead, so that it does not
+        delay the others; its samples are NaN and its status is ``CHART_SINGULAR``.
         """
 
     @abc.abstractmethod
     def finish(self, scene: Scene, y: PyTree[Array], t: Array) -> tuple[Array, Array, Array]:
-        """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
+        """wxyz, omega_body and whether the chart is regular there, of sampled components (N, T)."""
 
     def field_and_power(self, t, y, dynamics: Dynamics):
-        """The field, and the power [W] of what is not conservative as one more group: all of it,
-        then that of every wheel that is not held."""
+        """The field, and as an additional group the power [W] of the forces that are not
+        conservative: the total, then that of every wheel whose speed is not prescribed."""
         *state, _ = y
         instant_dynamics, pose = dynamics.at(*state[2:]), self.momentum_and_attitude(state[:2])
         powers = (external_power(t, *pose, instant_dynamics),)
@@ -94,8 +94,8 @@ class LiePoissonChart(AbstractChart):
     """Body momentum and unit quaternion: free of singularities.
 
     ``upright``: in a space frame whose z axis is along the scene's ``UniformGravity`` or the
-    constant position of its ``GravityGradient``, which must not vanish: of the attitude only one
-    row of R then matters, a third of the work.
+    constant position of its ``GravityGradient``, which must not vanish. The field then depends on
+    one row of R only, a third of the work.
     """
 
     upright: bool = eqx.field(static=True, default=False)
@@ -141,14 +141,14 @@ class LiePoissonChart(AbstractChart):
 
 
 def _as_numbers(y: PyTree[Array]) -> list[Array]:
-    """The groups of a state as arrays (..., n), in programs of derivatives with numbers in place of
-    NaN: see ``_failed``."""
+    """The groups of a state as arrays (..., n). In programs of derivatives, NaN is replaced by
+    numbers: see ``_failed``."""
     return [numbers(jnp.stack(group, axis=-1), 1.0) for group in y]
 
 
 def _rotate(turn: Array, wxyz: Array) -> Array:
-    """Product of one quaternion (..., 1, 4) with many (..., T, 4): by its columns as a matrix,
-    which takes half as long as ``rotation.multiply`` where there are many times."""
+    """Product of one quaternion (..., 1, 4) with many (..., T, 4), as a matrix product by columns:
+    for many times this takes half as long as ``rotation.multiply``."""
     a, b, c, d = jnp.unstack(turn, axis=-1)
     columns = ((a, b, c, d), (-b, a, d, -c), (-c, -d, a, b), (-d, c, -b, a))
     w, x, y, z = (
@@ -158,7 +158,7 @@ def _rotate(turn: Array, wxyz: Array) -> Array:
 
 
 def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
-    """Momenta of the coupled wheels as one more group of the state, or no group."""
+    """Momenta of the coupled wheels as an additional group of the state; () if there are none."""
     wheels = scene.dynamics.wheels
     if wheels is None or not wheels.coupled:
         return ()
@@ -166,14 +166,15 @@ def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
 
 
 def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPotential]:
-    """Turn (..., 4) from a frame with z along the field into space, and the field in that frame."""
+    """Rotation (..., 4) from a frame with z along the field to space, and the field in that
+    frame."""
     if isinstance(field, GravityGradient):
         (w, x, y), size = upward(components(field.position_space))
     else:
         gravity = components(field.gravity_space)
         (w, x, y), size = upward(gravity)
-        # Without gravity any axis will do, but derivatives across the one that is taken are lost:
-        # they are made NaN.
+        # If gravity is zero any axis is valid, but derivatives by components perpendicular to the
+        # chosen one are then not defined by these formulas: they become NaN.
         is_zero = jnp.all(field.gravity_space == 0, axis=-1)
         size = size + sum(underivable(g, is_zero) - g for g in gravity[:2])
         size = jnp.multiply(*jnp.broadcast_arrays(field.mass, size))
@@ -214,13 +215,15 @@ class EulerChart(AbstractChart):
 
 
 def _away_from_poles(q) -> Array:
-    """Whether the chart keeps at least half of the digits (its error grows like 1/sin theta)."""
+    """Whether at least half of the digits are correct (rounding errors grow like 1/sin theta)."""
     theta = q[1]
     return jnp.abs(jnp.sin(theta)) > jnp.sqrt(jnp.finfo(theta.dtype).eps)
 
 
 def momentum_scale(scene: Scene, state: State, ts: Array) -> Array:
-    """Natural unit of momentum of each lane: |L|, what the torques can add to it, what is slow."""
+    """Natural unit of momentum of each lane: the root of the sum of the squares of |L|, of the
+    momenta of coupled wheels, of the momentum that the initial torque produces within about one
+    radian, and of ``slow_momentum``."""
     t = ts[..., 0]
     momentum, spins = scene.momentum(state.omega_body, t), _spins(scene, state)
     y = (components(momentum), jnp.unstack(state.wxyz, axis=-1), *spins)
@@ -239,15 +242,15 @@ def _first_inertia(scene: Scene, ts: Array) -> Inertia:
 
 
 def slow_momentum(scene: Scene, ts: Array) -> Array:
-    """Momentum of a body that turns through one radian in the time simulated: a unit for one at
-    rest, which a torque may move later. Zero if no time passes."""
+    """Momentum of a body that rotates by one radian in the time simulated: a unit for a body at
+    rest, which a torque may accelerate later. Zero if the time span is zero."""
     span = jnp.abs(ts[..., -1] - ts[..., 0])
     size = jnp.trace(_first_inertia(scene, ts).tensor, axis1=-2, axis2=-1) / 3
     return jax.lax.stop_gradient(jnp.where(span > 0, size / jnp.where(span > 0, span, 1), 0))
 
 
 def natural_rates(scene: Scene, state: State, ts: Array) -> Array:
-    """Rates [rad/s] of lanes, for sorting them by the steps that they will need."""
+    """Rates [rad/s] of lanes, by which they are sorted so that similar steps are in one chunk."""
     carrier = scene.carrier_at(ts[..., 0])
     slowest = jnp.min(jnp.broadcast_to(carrier.moments, (state.wxyz.shape[0], 3)), -1)
     size = jnp.linalg.norm(state.omega_body, axis=-1)

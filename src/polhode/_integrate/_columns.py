@@ -1,9 +1,9 @@
-"""The extrapolated midpoint rule, once: one step of it, for whatever is integrated here.
+"""One step of the extrapolated midpoint rule, for states, integrals and derivatives.
 
 Columns of n = 2, 4, ... leapfrog substeps are combined so that the error terms in h^2, h^4, ...
 cancel (W. B. Gragg, SIAM J. Numer. Anal. 2 (1965) 384; E. Hairer, S. P. Norsett, G. Wanner, Solving
-Ordinary Differential Equations I, section II.9). The columns are worked out in a loop over a table
-that is data of the program, so that one program serves every order.
+Ordinary Differential Equations I, section II.9). The columns are computed in a loop over a table
+that is data of the program, so that the same program computes steps of every order.
 """
 
 from collections.abc import Callable
@@ -28,14 +28,14 @@ SEQUENCES = {
 }
 """Substeps of the columns of each order.
 
-Found by search over even numbers: within 15 % of the least work (evaluations per step over the
-step length that the error constant prod n_j^2 allows), the least amplification of rounding,
-sqrt(sum w_j^2 n_j). The harmonic sequence 2, 4, 6, ... amplifies it 3 (order 10) to 30 (order 20)
-times more.
+They are the result of a search over even numbers: among sequences within 15 % of the least work
+(evaluations per step over the step length that the error constant prod n_j^2 allows), those with
+the least amplification of rounding, sqrt(sum w_j^2 n_j). The harmonic sequence 2, 4, 6, ...
+amplifies it 3 (order 10) to 30 (order 20) times more.
 """
 
 CHOSEN = (6, 8, 10, 12, 14, 16)
-"""Orders that a program may choose between."""
+"""Orders between which a compiled program may choose."""
 
 
 def extrapolation_weights(sequence: tuple[int, ...]) -> tuple[Fraction, ...]:
@@ -55,11 +55,11 @@ def extrapolation_weights(sequence: tuple[int, ...]) -> tuple[Fraction, ...]:
 
 
 class Table(NamedTuple):
-    """Columns of one order, that with most substeps first and the others filled up with zeros.
+    """Columns of one order, the one with most substeps first, padded with zeros to K columns.
 
-    ``counts`` (K,): substeps; ``weights`` three of (K,): of the result, and of the differences of
-    the last two pairs of results of descending order, p - (p-2) and (p-2) - (p-4); ``length``:
-    columns that there are; ``order``.
+    ``counts`` (K,): substeps; ``weights``: three arrays (K,), for the result and for the
+    differences of the results of orders p and p - 2, and of orders p - 2 and p - 4; ``length``:
+    number of columns; ``order``: p.
     """
 
     counts: Array
@@ -81,7 +81,7 @@ def _row(order: int, length: int) -> list[np.ndarray]:
     counts = np.zeros(length, np.int32)
     for k, j in enumerate(place):
         counts[k] = sequence[j]
-        if k:  # the others enter by their small differences to the base, which has weight one
+        if k:  # the others contribute small differences from the base, whose weight is one
             weights[:, k] = [
                 float(x)
                 for x in (
@@ -99,8 +99,8 @@ def table(order: int | Array, dtype: Any) -> Table:
     lengths = np.array([len(SEQUENCES[o]) for o in orders], np.int32)
     index = 0 if isinstance(order, int) else (order.astype(jnp.int32) - orders[0]) >> 1
     rows = zip(*(_row(o, int(max(lengths))) for o in orders))
-    # Four small arrays, not one: a program with arrays above 512 bytes beside its units goes to
-    # several threads, which takes longer than all the rest of one body.
+    # Four small arrays instead of one: XLA distributes a program with arrays of more than 512 bytes
+    # outside of units over several threads, which takes longer than the whole motion of one body.
     counts, *weights = (np.stack(x) for x in rows)
     return Table(
         jnp.asarray(counts)[index],
@@ -119,9 +119,9 @@ def evaluations(order: int) -> int:
 
 
 class Columns(NamedTuple):
-    """What one step yields: ``change`` of the state, or the new state where the step is not
-    compensated; ``sums``, what integrals have gained; ``difference``: of the results of orders p
-    and p - 2; ``lower_difference``: of those of orders p - 2 and p - 4."""
+    """Results of one step: ``change``, of the state in a compensated step, otherwise the new state;
+    ``sums``: the integrals after the step; ``difference``: of the results of orders p and p - 2;
+    ``lower_difference``: of those of orders p - 2 and p - 4."""
 
     change: list[Array]
     sums: list[Array]
@@ -141,12 +141,13 @@ def extrapolated(
 ) -> Columns:
     """One step of the extrapolated midpoint rule.
 
-    ``rates(t, y, along)``: rates of the state and, where ``along``, of integrals along it, which
-    need every other point only. ``start_rates``: rates of ``y``. ``t`` and ``width`` are numbers,
-    or one each for every entry of the arrays. ``compensated``: changes are summed, not states.
+    ``rates(t, y, along)``: rates of the state and, if ``along``, of the ``integrals`` along the
+    solution, whose integrands are needed at every other point only. ``start_rates``: rates of
+    ``y``. ``t`` and ``width`` are scalars, or arrays with one entry for every body.
+    ``compensated``: changes of the state are summed instead of states.
     """
-    # Changes instead of states: their rounding is relative to the change of one step, not to the
-    # state. Costs an addition in every substep, and is only used where `rtol` is near rounding.
+    # Rounding errors of changes are relative to the change in one step, not to the state. This
+    # costs an addition in every substep, and is only used if `rtol` is close to rounding.
     origin = [jnp.zeros_like(x) for x in y] if compensated else y
 
     def place(a):
@@ -164,16 +165,17 @@ def extrapolated(
             f, _ = rates(time + h, place(a), False)
             return a, _plus(b, step, f), sums
 
-        # Leapfrog over a and b by turns, started by an Euler step. Gragg's smoothing of the end is
-        # left out: columns end at an even point, whose expansion has even powers without it.
+        # Leapfrog steps of a and b alternately, started by an Euler step. Gragg's smoothing at the
+        # end is omitted: the columns end at an even point, where the error has an expansion in even
+        # powers without it.
         b = _plus(origin, [x / 2 for x in step], start_rates)
         start = origin, b, [jnp.zeros_like(x) for x in integrals]
         a, b, sums = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
         f, g = rates(t + (width - h), place(b), True)
         return _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
 
-    # The column with most substeps is the base, and the others enter by their differences to it:
-    # large weights then multiply small numbers, and amplify rounding less.
+    # The column with most substeps is the base, and the others contribute their differences from
+    # it: large weights then multiply small numbers, and amplify rounding less.
     def add(j, carry):
         base, (result, sums), difference, lower_difference = carry
         count, *shares = (

@@ -1,4 +1,5 @@
-"""Solves by diffrax: their arguments, from edge to edge of pulses, and in one step."""
+"""Arguments of ``diffrax.diffeqsolve``; solutions in segments between the edges of pulses, and in a
+single step of diffrax."""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,7 +28,7 @@ class Stepping(NamedTuple):
 
 
 class Request(NamedTuple):
-    """Requirements of a solve: times, error at the last of them, first or longest step, maximum
+    """Requirements of a solution: times, error at the last of them, first or longest step, maximum
     number of steps; whether only the last state is saved, and whether the rates may jump."""
 
     ts: Array
@@ -104,20 +105,22 @@ def in_segments(
     torque: AbstractTorque,
     final_only: bool,
 ) -> Solution:
-    """``move(acting, y, times, parts)`` from edge to edge of ``torque``: from ``times[0]`` to
-    ``times[-1]``, by the torque ``acting`` between them, with one of ``parts`` equal shares of the
-    error; ``rates(acting, t, y)``: of the state.
+    """The solution in segments between the edges of ``torque``.
 
-    ``times`` may repeat its first. Derivatives by the edges are those of the ends of segments.
+    ``move(acting, y, times, parts)`` solves one segment from ``times[0]`` to ``times[-1]`` under
+    the torque ``acting`` there, with one of ``parts`` equal shares of the error; the first entry of
+    ``times`` may occur several times. ``rates(acting, t, y)``: of the state. Derivatives by the
+    edges are those by the ends of the segments.
     """
     start, end = ts[0], ts[-1]
     sign = jnp.where(end < start, -1, 1).astype(ts.dtype)
-    # an edge outside stands at the end of the span, and moves with it
+    # An edge outside of the span is placed at its end, and has the derivative of that end.
     within = jnp.clip(torque.edges, jnp.minimum(start, end), jnp.maximum(start, end))
     order = jnp.argsort(sign * within)
     bounds = jnp.concatenate([start[None], within[order], end[None]])
     parts = bounds.shape[0] - 1
-    # Of edges at one time, too, one comes first: what acts between two is told by their numbers.
+    # Edges are replaced by their ordinal numbers, so that the torque between two edges is defined
+    # even if they are at the same time.
     numbers = jnp.arange(parts - 1, dtype=within.dtype)
     numbered = _with_edges(torque, sign * jnp.zeros_like(within).at[order].set(numbers))
     moves = is_differentiated([ts, within])
@@ -127,7 +130,8 @@ def in_segments(
         a, b, number = segment
         is_empty = a == b
         acting = numbered.during(sign * (number - 0.5))
-        # an empty segment is solved over another length and discarded, for derivatives exist
+        # An empty segment is solved over another length and the result discarded, so that no
+        # derivative is NaN.
         stop = jnp.where(is_empty, a + (end - start) / 16, b)
         inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~is_empty
         if final_only:
@@ -147,7 +151,7 @@ def in_segments(
             out = jax.tree.map(
                 lambda old, new: jnp.where(inside[:, None], new[rows], old), out, solution.samples
             )
-        # through an empty segment, whose ends have derivatives of their own
+        # An empty segment changes nothing, but has derivatives by both of its ends.
         step = jnp.where(is_empty, b - a - jax.lax.stop_gradient(b - a), 0)
         y = jax.lax.cond(
             moves,
@@ -155,7 +159,7 @@ def in_segments(
             lambda y: y,
             y,
         )
-        # the last row: only samples have derivatives
+        # the last sample, not ``end_state``: only samples have derivatives
         y = jax.tree.map(lambda old, new: jnp.where(is_empty, old, new[-1]), y, solution.samples)
         return (y, out, steps, status, error), None
 
@@ -181,7 +185,8 @@ def in_segments(
 def _with_edges(torque: AbstractTorque, edges: Array) -> AbstractTorque:
     """The torque with other edges, in the order of ``AbstractTorque.edges``."""
     arrays, static = eqx.partition(torque, eqx.is_inexact_array)
-    # each edge is one number of one array: the transpose puts numbers where they come from
+    # Each edge is one entry of one array, so that the transpose of ``edges`` writes numbers to
+    # these entries.
     _, put = jax.vjp(lambda arrays: eqx.combine(arrays, static).edges, arrays)
     (places,), (values,) = put(jnp.ones_like(edges)), put(edges)
     arrays = jax.tree.map(lambda x, at, new: jnp.where(at != 0, new, x), arrays, places, values)
@@ -189,16 +194,18 @@ def _with_edges(torque: AbstractTorque, edges: Array) -> AbstractTorque:
 
 
 WAY_BACK = 8
-"""Intervals between saved times from each of which a derivative goes back where torques act."""
+"""Minimum number of intervals of the adjoint integration if torques act: it restarts from the saved
+state at the end of each."""
 
 
 def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, Array]:
-    """``ts`` with times in between from which derivatives by ``ts`` or ``inputs`` start anew, and
-    the rows of ``ts`` (of its last time if ``final_only``) among them. ``ts`` may repeat its first.
+    """``ts`` with additional times at which the adjoint integration restarts, and the rows of
+    ``ts`` (of its last time if ``final_only``) among them.
 
-    Backward through damping errors grow by exp(rate of damping * time). Without a derivative, and
-    where the dtype does not tell them apart, the times in between are the first, which costs no
-    step.
+    Backwards through damping, errors grow by exp(rate of damping * time). The additional times are
+    used in programs with derivatives by ``ts`` or ``inputs`` only. Otherwise, and if they are not
+    distinct in this dtype, they are equal to the first time, which costs no step. The first entry
+    of ``ts`` may occur several times.
     """
     arrays = [x for x in jax.tree.leaves((ts, inputs)) if eqx.is_inexact_array(x)]
     intervals = ts.shape[0] - 1
@@ -216,11 +223,11 @@ def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, A
 
 
 class GivenTimes(diffrax.StepTo):
-    """``diffrax.StepTo`` for times that are in order and whose ends are those of the solve.
+    """``diffrax.StepTo`` without checks, for sorted times whose ends are those of the solution.
 
-    Its checks raise from inside the program, by callbacks of the host, which keep the program out
-    of JAX's persistent cache and from being exported for other platforms. ``ph.simulate`` checks
-    times before, or marks them in its status.
+    The checks of ``diffrax.StepTo`` raise errors inside the program by callbacks of the host.
+    Programs with callbacks cannot be stored in JAX's persistent cache, nor exported for other
+    platforms. ``ph.simulate`` checks concrete times before, and reports traced ones in the status.
     """
 
     def wrap(self, direction):
@@ -232,7 +239,7 @@ class GivenTimes(diffrax.StepTo):
 
 
 def is_one_step(controller: Any, saveat: diffrax.SaveAt, event: Any, meter: Any) -> bool:
-    """Whether a solve consists of one step, of which nothing but the state is saved."""
+    """Whether a solution consists of one step, of which only states are saved."""
     subs = jax.tree.leaves(saveat.subs, is_leaf=_is_sub)
     return (
         isinstance(controller, diffrax.StepTo)
@@ -245,9 +252,9 @@ def is_one_step(controller: Any, saveat: diffrax.SaveAt, event: Any, meter: Any)
 
 
 def one_step(terms, args, solver, saveat: diffrax.SaveAt, state: Any) -> Any:
-    """diffrax's ``state`` after the step from its ``tprev`` to its ``tnext``.
+    """diffrax's ``state`` after the step from its ``tprev`` to its ``tnext``, without the loop.
 
-    A loop of one turn carries all of its arrays as copies, and is compiled as a loop.
+    A loop of one iteration would copy all arrays of its carry, and would be compiled as a loop.
     """
     end = state.tnext
     y, _, _, solver_state, result = solver.step(
@@ -258,7 +265,7 @@ def one_step(terms, args, solver, saveat: diffrax.SaveAt, state: Any) -> Any:
         points = [(state.tprev, state.y)] * sub.t0 + [(end, y)] * (sub.steps == 1 or sub.t1)
         rows = [(t, sub.fn(t, point_state, args)) for t, point_state in points]
         ts, ys = (jax.tree.map(lambda *x: jnp.stack(x), *column) for column in zip(*rows))
-        count = len(rows)  # rooms for more steps stay as they are
+        count = len(rows)  # rows for further steps are not changed
         ts, ys = jax.tree.map(
             lambda new, room: jnp.concatenate([new, room[count:]]),
             (ts, ys),

@@ -1,7 +1,7 @@
-"""One step of an explicit Runge-Kutta rule, of several bodies side by side.
+"""One step of an explicit Runge-Kutta method, for several bodies at a time.
 
-The stages are a loop, so that the field stands in the compiled program once. Coefficients:
-``_tableau.py``.
+The stages are computed in a loop, so that the compiled program contains the field once. The
+coefficients are in ``_tableau.py``.
 """
 
 import functools
@@ -20,14 +20,16 @@ from polhode._kernels import any_of
 class Motion(NamedTuple):
     """Equations of motion of B bodies.
 
-    ``rates(coefficients, levels, t, y)``: rates (D, B), margins (K, B) and the levels (K, B) to
-    which each switch would turn, for levels (K, B), times (B,) and states (D, B);
-    ``levels(arguments, t, y)``: the levels at a point; ``units(unit_data, y, rates)``: weights of
-    the components of an error, the squares of which are summed, and natural rates [rad/s] (B,). The
-    last ``events`` of the K ``switches`` are events; ``jumps``: for each switch, whether the rates
-    may jump there, empty where they do at none; ``swift``: the switches whose margins must be
-    resolved by the steps (see ``is_unresolved``); ``rule``: of the steps; ``is_whole``: whether one
-    unit can hold the field, and so the whole loop."""
+    - ``rates(coefficients, levels, t, y)``: rates (D, B), margins (K, B) and new levels (K, B) of
+      switches that turn, for levels (K, B), times (B,) and states (D, B);
+    - ``levels(arguments, t, y)``: the levels at a point;
+    - ``units(unit_data, y, rates)``: weights of the components of an error, for the root of the sum
+      of squares, and natural rates [rad/s] (B,);
+    - ``switches``: their number K, of which the last ``events`` are events;
+    - ``jumps``: for each switch, whether the rates may jump there; empty if they jump at none;
+    - ``swift``: switches whose margins the steps must resolve (see ``is_unresolved``);
+    - ``rule``: the Runge-Kutta method;
+    - ``is_whole``: whether a unit can contain the field, and thereby the whole loop."""
 
     rates: Callable[..., tuple[Array, Array, Array]]
     levels: Callable[..., Array]
@@ -48,13 +50,12 @@ class Progress(NamedTuple):
 
     ``elapsed``: time since the start [s]; ``y``, ``rate``: state and its rates; ``levels``,
     ``margin``: of the switches at ``y``; ``just_turned``: switches that turned at the start of the
-    step; ``needs_rates``: whether ``rate`` must be evaluated anew; ``width``: of the next step [s];
+    step; ``needs_rates``: whether ``rate`` is outdated; ``width``: of the next step [s];
     ``last_error``: logarithm of the last error over its tolerance; ``angle`` so far [rad];
     ``error``: sum of estimated errors; ``steps`` accepted and ``attempts``;
-    ``at_switches``: steps that ended where a switch turned; ``unstable``: as wide as stability
-    allows; ``reversals``: consecutive switches
-    that turned back at once; ``place``: index of the next sample; ``count``:
-    of events; ``outcome``."""
+    ``at_switches``: steps that ended at a switch; ``unstable``: steps limited by stability;
+    ``reversals``: consecutive switches that turned back at once; ``place``: index of the next
+    sample; ``count``: of events; ``outcome``."""
 
     elapsed: Array
     y: Array
@@ -78,11 +79,12 @@ class Progress(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A step that may be refused.
+    """An attempted step.
 
     ``h`` (B,): signed width; ``stages`` (S, D, B): rates; ``margins`` (S, K, B); ``new_levels``
-    (K, B): to which switches would turn at the start; ``depths`` (M, K, B): of turning points of
-    the margins; ``dense`` (7 or 4, D, B): coefficients of dense output, valid where requested."""
+    (K, B): levels of switches that turn at the start; ``depths`` (M, K, B): minima of the margins
+    between stages (see ``_depths``); ``dense`` (7 or 4, D, B): coefficients of dense output, valid
+    where requested."""
 
     h: Array
     stages: Array
@@ -96,10 +98,10 @@ def attempt_step(
     motion: Motion, progress: Progress, t: Array, h: Array, needs_dense: Array
 ) -> Attempt:
     """A step of each body, of signed width ``h`` (B,) from ``t`` (B,). The stages of dense output
-    are skipped unless a body ``needs_dense`` (B,) or has a switch near.
+    are skipped unless a body ``needs_dense`` (B,) or a switch of it may turn in the step.
 
-    Both phases, the stages of the step and those of dense output, are turns of one loop, so that
-    the field stands in the program once."""
+    Both phases, the stages of the step and those of dense output, are iterations of one loop, so
+    that the program contains the field once."""
     dtype, rule = progress.y.dtype, motion.rule
     table, nodes = in_parts(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
     stages = _stage_buffer(progress.rate, rule)
@@ -116,9 +118,9 @@ def attempt_step(
             new_levels = jnp.where(i == 0, turn, new_levels)
         return stages, margins, new_levels
 
-    # The second phase runs only where it is needed, and the first one skips the stage that the
-    # previous step has left: the bounds of the inner loop decide both. A `cond` around a second
-    # loop would put the field into the program twice.
+    # The bounds of the inner loop skip the second phase where it is not needed, and the first stage
+    # where the previous step has computed it. A `cond` with a second loop would put the field into
+    # the program twice.
     def phase(number, carry):
         *stage_carry, depths, inside = carry
         dense_end = jnp.where(inside, rule.dense_stages, rule.stages)
@@ -126,8 +128,7 @@ def attempt_step(
         begin = jnp.where(number == 0, first_stage, rule.stages)
         end = jnp.where(number == 0, rule.stages, dense_end)
         stage_carry = jax.lax.fori_loop(begin, end, stage, tuple(stage_carry))
-        # Margins are known at the stages anyhow. Whether the dense output is needed to locate a
-        # switch is seen from them, before it is paid for.
+        # The margins at the stages show whether dense output is needed to locate a switch.
         if events:
             depths = jnp.where(
                 number == 0, _depths(margin_samples(stage_carry[1], rule), rule), depths
@@ -160,8 +161,8 @@ def dense_of(h: Array, stages: Array, rule: Tableau) -> Array:
 
 def dense_state(y: Array, dense: Array, x: Array) -> Array:
     """States (D, B) at the fractions ``x`` (B,) of a step from ``y``."""
-    # Nested as x (a + (1 - x) (b + x (c + ...))): exact at both ends, where every factor beyond
-    # the first vanishes. In powers of x the ends would carry the rounding of all terms.
+    # Nested as x (a + (1 - x) (b + x (c + ...))): exact at both ends, where all further terms
+    # vanish. In powers of x the end would contain the rounding errors of all terms.
     total, x = jnp.zeros_like(y), x[None]
     complement = 1 - x
     for k in range(dense.shape[0] - 1, -1, -1):
@@ -171,18 +172,18 @@ def dense_state(y: Array, dense: Array, x: Array) -> Array:
 
 def margin_samples(margins: Array, rule: Tableau) -> Array:
     """Margins (M, K, B) in order of time; a switch that has just turned starts at zero."""
-    # The stages of a rule do not stand in order of time, and some lie so close together, or so far
-    # off the solution, that they tell nothing more: the tableau names those that are looked at.
+    # The stages are not in order of time, and some are too close to each other, or too far from
+    # the solution, to be of use: the tableau lists those that are used.
     sampled = jnp.stack([margins[k] for k in rule.margin_stages])
     return jnp.concatenate([jnp.maximum(sampled[:1], 0), sampled[1:]])
 
 
 def _depths(sampled: Array, rule: Tableau) -> Array:
     """Minimum of the parabola through three neighbouring margins (M - 2, K, B), relative to the
-    least of the three; 1 where it does not lie between them."""
-    # A margin that dips below zero and returns between two stages shows in the parabola through
-    # its neighbours only. Sampling more densely instead would cost an evaluation for each sample;
-    # the parabolas cost none, and the search confirms a dip before it counts.
+    smallest of the three; 1 if the minimum is not between them."""
+    # A margin that falls below zero and returns between two stages can only be recognised from the
+    # parabola through its neighbours. More samples would cost an evaluation each; the parabolas
+    # cost none, and the search verifies every minimum.
     x = np.array(rule.margin_nodes)
     inverse = 1 / np.diff(x)
 
@@ -191,7 +192,8 @@ def _depths(sampled: Array, rule: Tableau) -> Array:
 
     chords = (sampled[1:] - sampled[:-1]) * column(inverse)
     left, bend = chords[:-1], (chords[1:] - chords[:-1]) * column(1 / (x[2:] - x[:-2]))
-    # slopes at both ends tell whether it turns between them, without a division for most
+    # The derivatives at both ends show whether the minimum is between them; only then is a division
+    # needed.
     falls = left - bend * column(x[1:-1] - x[:-2])
     rises = left + bend * column(2 * x[2:] - x[:-2] - x[1:-1])
     a = sampled[:-2]
@@ -202,7 +204,8 @@ def _depths(sampled: Array, rule: Tableau) -> Array:
 
 
 def vertex_of(x, f):
-    """Minimum of the parabola through three points and its value; far away if there is none."""
+    """Position and value of the minimum of the parabola through three points; the position is
+    beyond the step if there is no minimum."""
     (x0, x1, x2), (a, b, c) = x, f
     left, right = (b - a) / (x1 - x0), (c - b) / (x2 - x1)
     bend = (right - left) / (x2 - x0)
@@ -230,9 +233,10 @@ def column(storage: Array, k: Array) -> Array:
 def in_parts(weights: np.ndarray, dtype: np.dtype) -> list[Array]:
     """Weights as a sum of arrays of ``dtype``: two in single precision, one in double.
 
-    A rounded weight is off by the same amount in every step, so that in single precision momenta
-    drift in proportion to the steps and attitudes to their square: after some hundred radians up to
-    30 times as far as by rounding of the steps, which has either sign."""
+    A rounded weight has the same error in every step. In single precision, errors of the momentum
+    would therefore grow in proportion to the number of steps, and those of the attitude to its
+    square: after some hundred radians they are up to 30 times as large as those by rounding within
+    the steps, which has random sign."""
     rounded = np.asarray(weights, dtype)
     rest = np.asarray(weights - rounded, dtype)
     return [jnp.asarray(part) for part in ([rounded, rest] if rest.any() else [rounded])]
@@ -240,8 +244,8 @@ def in_parts(weights: np.ndarray, dtype: np.dtype) -> list[Array]:
 
 def weighted(weights: np.ndarray | list[Array], stages: Array) -> Array:
     """Sum (D, B) of ``stages`` (S, D, B) with ``weights`` (S,), or with the sum of several arrays
-    of weights. Summed term by term it is one fused loop; a matrix product would not fit into a
-    fused kernel."""
+    of weights. A sum of terms becomes one fused loop; a fused kernel cannot contain a matrix
+    product."""
     parts = in_parts(weights, stages.dtype) if isinstance(weights, np.ndarray) else weights
     sums = [
         jnp.sum(part[:, None, None] * stages[: part.shape[0]], axis=0) for part in reversed(parts)
@@ -250,6 +254,6 @@ def weighted(weights: np.ndarray | list[Array], stages: Array) -> Array:
 
 
 def _stage_buffer(first_stage: Array, rule: Tableau) -> Array:
-    """Room for all stages, the first of them set."""
+    """An array for all stages, with the first one set and zeros for the others."""
     zeros = jnp.zeros((rule.dense_stages - 1, *first_stage.shape), first_stage.dtype)
     return jnp.concatenate([first_stage[None], zeros])

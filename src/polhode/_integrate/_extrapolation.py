@@ -48,13 +48,14 @@ def _tables(nodes: int) -> tuple[np.ndarray, ...]:
 def collocate(terms, t0, t1, nodes, y1, args, order: int) -> dict:
     """Chebyshev series of the solution on each substep, of the method's own accuracy.
 
-    ``nodes`` holds the states that the substeps start from along a leading axis, ``y1`` the end.
-    Each series starts from the cubic of the end values and slopes; ``order`` Picard sweeps
-    y <- y0 + int f(y) dt on ``order + 2`` nodes gain an order each. End values stay as given.
+    ``nodes`` contains the states at the start of each substep along a leading axis, ``y1`` the
+    state at the end. Each series starts from the Hermite cubic of the end values and their rates;
+    each of the ``order`` Picard sweeps y <- y0 + int f(y) dt on ``order + 2`` nodes gains one
+    order. End values do not change.
     """
-    # The midpoint rule leaves no stages from which its order could be had between the substeps.
-    # Picard iteration evaluates at new places instead, and only if someone asks for states within a
-    # step: otherwise the compiler removes it.
+    # The midpoint rule has no stages from which the solution between the substeps could be
+    # interpolated in its order. Picard iteration evaluates the field at new points instead. The
+    # compiler removes it unless states within a step are requested.
     x, matrix, series = _tables(order + 2)
     count = jax.tree.leaves(nodes)[0].shape[0]
     ends = jax.tree.map(lambda y, end: jnp.concatenate([y[1:], end[None]]), nodes, y1)
@@ -124,10 +125,10 @@ class CollocationInterpolation(diffrax.AbstractLocalInterpolation):
 
 
 class Accuracy(eqx.Module):
-    """An error asked for at the last time, and how far it is to go there.
+    """The error requested at the last time, and the duration of the motion.
 
     **Arguments:** ``rtol``: sum of errors, relative to the natural units of the state (for a body:
-    attitude in radians, momentum over its size); ``horizon``: time from the first to the last [s];
+    attitude in radians, momentum over its size); ``horizon``: from the first to the last time [s];
     ``times`` (T,): see ``Extrapolation.spanning``.
     """
 
@@ -140,25 +141,26 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     r"""Extrapolated explicit midpoint rule of even order (4 to 20).
 
     Columns of $n_j = 2, 4, \dots, p$ leapfrog substeps are combined so that the error terms in
-    $h^2, h^4, \dots, h^{p-2}$ cancel. A substep is one evaluation and one addition, so the few
-    live arrays stay in the cache and no stage is kept.
+    $h^2, h^4, \dots, h^{p-2}$ cancel. A substep is one evaluation and one addition, and no stages
+    are stored, so that the few arrays stay in the cache.
 
     - ``formal_order``: order $p$. None: chosen from ``accuracy`` in the program (8 to 16; 10 in
       float32).
-    - Conserves nothing exactly; $|q|$, energy and momenta to the accuracy of the step.
+    - No quantity is conserved exactly; $|q|$, energy and momenta to the accuracy of the step.
     - ``evaluations`` of the field per step (order 8: 21, order 12: 43, order 16: 81).
     - ``compensated``: sums the changes within a step, not the states, and carries the rounding
       error of the state to the next step: less rounding, at a third more time.
-    - ``accuracy``: None for one step of the method a step of diffrax, with an error estimate (the
-      difference to order $p - 2$) for any of its controllers. With an ``Accuracy`` one step of
+    - ``accuracy``: None: each step of diffrax is one step of the method, with an error estimate
+      (the difference to order $p - 2$) for any of its controllers. With an ``Accuracy`` one step of
       diffrax consists of as many steps of the method as the tolerance requires, so that the
-      overhead of diffrax is paid once for each saved time; use ``diffrax.StepTo(ts)`` with it. All
+      overhead of diffrax arises once for each saved time; use ``diffrax.StepTo(ts)`` with it. All
       arrays of the state then have one shape, and their entries are independent bodies.
-      ``max_steps``: maximum number of steps of a body; one that needs more ends as NaN. ``jumps``:
-      search for jumps of the field near the ends of a step.
-    - Reverse mode cannot pass through its steps, forward mode can: ``FlowAdjoint`` has both.
-    - Dense output: without ``accuracy`` collocation polynomials as accurate as the step, which cost
-      some times the step itself, and nothing unless interpolated. With it none (NaN).
+      ``max_steps``: maximum number of steps of a body; a body that needs more ends as NaN.
+      ``jumps``: search for jumps of the field near the ends of a step.
+    - Its steps can be differentiated in forward mode only: ``FlowAdjoint`` permits both modes.
+    - Dense output: without ``accuracy``, collocation polynomials as accurate as the step. They take
+      several times as long as the step itself, and are computed only if the solution is
+      interpolated. With ``accuracy`` there is none (NaN).
 
     ??? cite "Reference"
         W. B. Gragg, SIAM J. Numer. Anal. 2 (1965) 384; R. Bulirsch, J. Stoer, Numer. Math. 8
@@ -192,7 +194,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         return 12 if self.formal_order is None else self.formal_order
 
     def stepping(self, request: Any) -> Any:
-        """Arguments of diffrax for ``ph.LiePoisson`` and ``ph.EulerAngles``: one call for all."""
+        """Arguments of ``diffrax.diffeqsolve`` for ``ph.LiePoisson`` and ``ph.EulerAngles``."""
         horizon = jnp.abs(request.ts[-1] - request.ts[0])
         accuracy = Accuracy(*jax.lax.stop_gradient((request.rtol, horizon)))
         solver = Extrapolation(
@@ -201,8 +203,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         return request.in_one_call(solver)
 
     def bodies_at_once(self, terms: PyTree, t: Array, y: PyTree, args: PyTree) -> int:
-        """Number of bodies of one solve: a whole work queue where bodies have steps of their own,
-        else as many as there are lanes."""
+        """Number of bodies in one solution: a whole work queue if bodies can be exchanged in their
+        lanes (``by_entry``), otherwise as many as there are lanes."""
         dtype = jnp.result_type(*jax.tree.leaves(y))
         rates = BoundTerm.of(terms, args).prepare(t, y, dtype)
         return _policy.QUEUE if rates.by_entry else _policy.LANES
@@ -261,12 +263,13 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         return y1, error, dense, compensation, diffrax.RESULTS.successful
 
     def spanning(self, controller: diffrax.StepTo, state: Any) -> tuple["Extrapolation", Any, Any]:
-        """Itself, the controller and the ``state`` of a solve by diffrax, with one step from the
-        first of the controller's times to the last, that finds the states at all of them: the
-        ``rows`` (n, T + 1, C) of its own state are C components of n bodies."""
+        """The solver, the controller and the ``state`` of diffrax for a solution in one step.
+
+        The step leads from the first of the controller's times to the last, and stores the states
+        at all of them: C components of n bodies as ``rows`` (n, T + 1, C) of the solver's state."""
         leaves, times = jax.tree.leaves(state.y), controller.ts
-        # A step of diffrax for each saved time would make every body wait at each of them; in one
-        # step for all times a body that has reached one goes on.
+        # With a step of diffrax for each saved time, all bodies would wait for the last one at each
+        # time. In one step for all times a body continues when it has reached a saved time.
         if self.accuracy is None or jnp.ndim(leaves[0]) != 1 or times.shape[0] == 2:
             return self, controller, state
         dtype = jnp.result_type(*leaves)
@@ -278,10 +281,10 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         return solver, GivenTimes(times[np.array([0, -1])]), state
 
     def _take_many_steps(self, accuracy: Accuracy, terms, t0, t1, y0, args, progress: Progress):
-        """As many as the error asked for needs."""
+        """As many steps of the method as ``accuracy`` requires."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
-        # traced once, and taken apart into what is computed before the steps and in each of them
+        # traced once, and divided into coefficients, computed before the steps, and the field
         problem = BoundTerm.of(terms, args).prepare(t0, y0, dtype)
         rtol = jnp.asarray(accuracy.rtol, dtype)
         elapsed = None if accuracy.times is None else accuracy.times - t0
@@ -295,8 +298,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
             def table_for(rate):
                 if self.formal_order is not None:
                     return table(self.formal_order, dtype)
-                gap = jnp.abs(span[1] - span[0])  # for the way from time to time
-                if elapsed is not None:
+                gap = jnp.abs(span[1] - span[0])
+                if elapsed is not None:  # mean interval between saved times
                     gap = gap / jnp.sum(jnp.where(elapsed > 0, 1, 0)).astype(gap.dtype)
                 return table(order_for(rtol, jnp.max(rate, initial=0) * gap.astype(dtype)), dtype)
 
@@ -317,7 +320,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
 
 
 def units_of(args: Any, y0: PyTree, horizon: Array) -> Any:
-    """Natural units of the states: those that the arguments of the field state, or of any state."""
+    """Natural units of the states: those among the arguments of the field, otherwise
+    ``GroupUnits``."""
     if not isinstance(args, Dynamics | FixedArguments) or args.units is None:
         return GroupUnits.of(y0, horizon)
     return jax.lax.stop_gradient(args.units)
@@ -328,19 +332,21 @@ def _apply_units(units, y, rates):
 
 
 def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
-    """The order of least work for a tolerance, as a traced number.
+    """The order with the least work for a tolerance, as a traced number.
 
-    Measured on 1,000 tops (order 14 takes least time, or within a tenth of it, down to 1e-9), but
-    lower where long steps of a high order make its error estimate a loose one
-    (``benchmarks/error_control.py``), and in single precision, where it enlarges rounding.
+    It was measured on 1,000 tops: order 14 takes the least time, or up to a tenth more, down to an
+    ``rtol`` of 1e-9. The order is lower at large tolerances, where the long steps of a high order
+    make the error estimate less reliable (``benchmarks/error_control.py``), and in single
+    precision, where a high order amplifies rounding.
 
-    Lower still where steps are to end within ``angle`` [rad], since states are saved there: such
-    that the fewest evaluations lead that far. The same tops took steps of
-    (0.27 p - 0.3) rtol^(1 / (p + 1)) rad in the mean with order p from 6 to 14. Nine tenths of that
-    cost least at 100 times in 10 to 30 s: three fifths up to a sixth more, 1.2 up to a third more.
+    The order is also lower if steps have to end after ``angle`` [rad], at saved times: the order
+    that covers this angle with the fewest evaluations. For the same tops, the mean step at order p
+    from 6 to 14 is (0.27 p - 0.3) rtol^(1 / (p + 1)) rad. For 100 saved times in 10 to 30 s a
+    factor of 0.9 on this length takes the least time; 0.6 takes up to a sixth more, 1.2 up to a
+    third more.
     """
-    # Four bounds are enough for the order: a model of the work would have to know the motion, and
-    # gains a tenth at most.
+    # Four bounds are sufficient: a model of the work would depend on the motion, and would save a
+    # tenth of the time at most.
     best = 10
     if jnp.finfo(rtol.dtype).eps < 1e-9:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))
@@ -361,18 +367,18 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
 class Automatic(Extrapolation):
     """The solver that ``ph.simulate`` chooses.
 
-    Few bodies on which torques act, and fields with kinks or jumps, are moved by explicit
-    Runge-Kutta steps that end where the field kinks or jumps (``_loop.py``); others by the
+    Small batches of bodies under torques, and fields with kinks or jumps, are integrated by
+    explicit Runge-Kutta steps that end at the kinks or jumps (``_loop.py``); all others by the
     extrapolated midpoint rule, with the arguments of ``ph.Extrapolation``.
 
-    ``low_order``: take steps of order 5 where the field has many switches; ``located``: False:
-    explicit steps of order 5 for all fields, through their switches.
+    ``low_order``: take steps of order 5 if the field has many switches; ``located=False``: explicit
+    steps of order 5 for all fields, which do not end at switches.
     """
 
     low_order: bool = eqx.field(static=True, default=False)
     located: bool = eqx.field(static=True, default=True)
 
     def rule(self, switches: int) -> Tableau:
-        """The explicit rule for a field with so many switches."""
+        """The explicit Runge-Kutta method for a field with this number of switches."""
         has_many = switches >= _policy.LOW_ORDER_SWITCHES
         return TSIT5 if not self.located or (self.low_order and has_many) else DOP853

@@ -14,7 +14,7 @@ from polhode._kernels import formula, specialise
 
 
 class BoundTerm(eqx.Module):
-    """Term and arguments: their arrays, and everything else as static structure."""
+    """A diffrax term with its arguments, divided into arrays and static structure."""
 
     arrays: Any
     static: Any = eqx.field(static=True)
@@ -29,7 +29,7 @@ class BoundTerm(eqx.Module):
         return jax.tree.map(lambda c: jnp.asarray(c, dtype), terms.contr(t0, t1))
 
     def forward(self, dtype):
-        """The control of one second, for an ODE one: minus one where diffrax turns the time."""
+        """The control over one second: for an ODE 1, or -1 where diffrax reverses the time."""
         return self.control(np.zeros(()), np.ones(()), dtype)
 
     def increment(self, t, y, control):
@@ -38,7 +38,8 @@ class BoundTerm(eqx.Module):
         return terms.vf_prod(t, y, args, control)
 
     def prepare(self, t, y, dtype) -> "Prepared":
-        """Rates of states like ``y``, with all that rests on the arguments worked out."""
+        """Rates of states like ``y``, with everything that depends on the arguments alone
+        computed."""
         arrays, tree = jax.tree.flatten(self.arrays)
         leaves, state_tree = jax.tree.flatten(y)
 
@@ -67,7 +68,7 @@ REVERSE_ONCE = (
 
 
 class FixedArguments(eqx.Module):
-    """All ``arrays`` that a field depends on, in place of its arguments; ``units``: the natural
+    """The ``arrays`` on which a field depends, instead of its arguments; ``units``: the natural
     units of its states, or None."""
 
     arrays: tuple[Array, ...]
@@ -81,9 +82,9 @@ def uses(jaxpr, place: int) -> bool:
 
 
 class Prepared(NamedTuple):
-    """``coefficients``: arrays on which the rates depend; ``run(coefficients, t, *y)``: the rates;
-    ``depends_on_time``: whether they depend explicitly on the time; ``by_entry``: see
-    ``_kernels._fold.Specialised``."""
+    """Rates after partial evaluation. ``coefficients``: arrays on which they depend;
+    ``run(coefficients, t, *y)``: the rates; ``depends_on_time``: whether they depend explicitly on
+    the time; ``by_entry``: see ``_kernels._fold.Specialised``."""
 
     coefficients: tuple[Any, ...]
     run: Callable[..., list[Any]]
@@ -91,8 +92,8 @@ class Prepared(NamedTuple):
     by_entry: bool
 
     def rates(self, coefficients, t, y) -> list[Any]:
-        """The rates, on lists of arrays; ``coefficients`` are passed explicitly so that a fused
-        kernel may take them as its operands."""
+        """The rates, as lists of arrays; ``coefficients`` are an argument so that they can be
+        operands of a fused kernel."""
         return self.run(coefficients, t, *y)
 
 
@@ -103,9 +104,9 @@ def weighted_length(weights: list[Array], error: list[Array]) -> Array:
 
 
 class GroupUnits(eqx.Module):
-    """Natural units of any state: each subtree at its top is a vector, measured by its length.
+    """Natural units of any state: each top-level subtree is a vector, whose unit is its length.
 
-    The unit of a vector that is zero is its rate times ``span`` [s].
+    The unit of a vector that is zero is its rate times a thousandth of ``span`` [s].
     """
 
     groups: tuple[int, ...] = eqx.field(static=True)
@@ -113,7 +114,7 @@ class GroupUnits(eqx.Module):
 
     @classmethod
     def of(cls, y: Any, span: Array) -> "GroupUnits":
-        """Of states like ``y``."""
+        """Units for states like ``y``."""
         parts = [y] if eqx.is_array(y) else jax.tree.leaves(y, is_leaf=lambda x: x is not y)
         return cls(tuple(len(jax.tree.leaves(part)) for part in parts), span)
 

@@ -1,8 +1,8 @@
 """Derivatives of the exact flow as a diffrax adjoint.
 
-The derivative is not that of the steps: forward mode integrates the variational equations along
+They are not derivatives of the steps: forward mode integrates the variational equations together
 with the state, reverse mode the adjoint equations from the end back to the start, both in steps of
-their own under their own error control. Neither keeps the path.
+their own with their own error control. Neither stores the solution between saved times.
 """
 
 from typing import Any
@@ -26,15 +26,15 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
     r"""Derivatives of the exact flow, in forward and in reverse mode, for any solver.
 
     Reverse mode solves $y' = f$, $\lambda' = -\lambda\,\partial f/\partial y$,
-    $\mu' = -\lambda\,\partial f/\partial c$ backwards, $c$ the coefficients that the field is made
-    of, as far as they depend on what is differentiated. The derivatives are accurate to
-    ``rtol``, whatever steps the solver took, and memory does not grow with the steps.
+    $\mu' = -\lambda\,\partial f/\partial c$ backwards, where $c$ are those coefficients of the
+    field that depend on the differentiated inputs. The derivatives are accurate to ``rtol``,
+    whatever steps the solver took, and memory does not grow with the number of steps.
 
     - ``rtol``: error of the derivatives relative to their size; None: that of the solver's
       ``accuracy``, or else 1e-9 in float64 and 1e-5 in float32.
-    - A field that contracts, as drag does, amplifies errors of the backward integration by
-      exp(rate of contraction * time). It restarts at every saved time; where torques act,
-      ``ph.simulate`` sees to it that there are eight.
+    - If the field contracts, as with drag, errors of the backward integration grow by
+      exp(rate of contraction * time). The integration restarts at every saved time; if torques
+      act, ``ph.simulate`` divides the motion into at least eight intervals.
     - The state: arrays of one shape, whose entries are bodies that the field treats separately.
     - Saved: the state itself, at the start, at given times, at the steps of ``diffrax.StepTo``, or
       at the end. Of several ``SubSaveAt`` the first is differentiated. Not for events.
@@ -70,12 +70,13 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated, keeps_rtol)
 
         coefficients, rates, _ = equations.prepare(c, t0, leaves)
-        rates = kernel(rates)  # for solvers that are not units themselves
+        rates = kernel(rates)  # for diffrax's solvers; polhode's own are units as a whole
 
         def field(t, y, fixed_arguments):
             return jax.tree.unflatten(tree, rates(fixed_arguments.arrays, t, *jax.tree.leaves(y)))
 
-        # The steps themselves are not differentiated, nor what the user's functions close over.
+        # The steps are not differentiated: all their inputs are constants to JAX, including the
+        # arrays over which the user's functions close.
         fixed_arguments = FixedArguments(
             coefficients, args.units if isinstance(args, Dynamics) else None
         )
@@ -111,11 +112,11 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
                 init_state=state,
                 **loop_arguments,
             )
-        if times is None:  # whatever steps the controller took
+        if times is None:  # the ends of the steps that the controller chose
             times = _first_sub(state.save_state).ts
         saved_states = jax.tree.leaves(_first_sub(state.save_state).ys)
         progress = state.solver_state
-        if isinstance(progress, Progress) and progress.rows is not None:  # found in one step
+        if isinstance(progress, Progress) and progress.rows is not None:  # all times in one step
             rows = progress.rows
             count, saved_times = times.shape[0], _first_sub(state.save_state).ts
             rows = jnp.transpose(rows[:, -1 - count : -1], (2, 1, 0))
@@ -124,7 +125,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
             state = eqx.tree_at(lambda s: _first_sub(s.save_state).ts, state, ts)
         count = min(
             times.shape[0], saved_states[0].shape[0]
-        )  # rooms for more steps stay as they are
+        )  # rows for further steps are not changed
         states = [x[:count] for x in saved_states]
         path = path_of(equations, c, leaves, t0, times[:count], states)
         path = [jnp.concatenate([x, s[count:]]) for x, s in zip(path, saved_states)]
@@ -141,7 +142,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
 
 
 def _first_sub(subs: Any) -> Any:
-    """Of one or several."""
+    """The first ``SubSaveAt``, or the corresponding state, of one or several."""
     return subs[0] if isinstance(subs, list | tuple) and not hasattr(subs, "_fields") else subs
 
 
@@ -151,7 +152,7 @@ def _stop_gradient(tree: Any) -> Any:
 
 
 def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
-    """The times that will be saved, in order; None where only the solve tells them."""
+    """The saved times, in order; None if the controller chooses them during the solution."""
     sub = _first_sub(saveat.subs)
     if event is not None or not isinstance(sub, diffrax.SubSaveAt):
         raise ValueError(
@@ -170,13 +171,13 @@ def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
 
 
 def path_of(equations: Equations, c, y0, t0, times, states):
-    """The states saved, with the derivatives of the flow."""
+    """The saved states (components (T, N)) with the derivatives of the flow."""
     size = len(y0)
 
     def rule(operands, tangents, states):
         def follow(inputs):
             t0, times, start, c = inputs[0], inputs[1], inputs[2 : 2 + size], inputs[2 + size :]
-            # what was never reached is nothing to follow
+            # times that were not reached are inf; the interval to them is replaced by an empty one
             times = jnp.where(jnp.isfinite(times), times, jax.lax.stop_gradient(t0))
             horizon = jax.lax.stop_gradient(jnp.max(jnp.abs(times - t0)))
             starts = jnp.concatenate([jnp.stack([t0]), times[:-1]])

@@ -1,6 +1,9 @@
-"""Derivatives of the exact flow: variational equations forward, adjoint equations backward.
+"""Derivatives of the exact flow: variational equations in forward, adjoint equations in reverse
+mode.
 
-Both are integrated by the extrapolated midpoint rule, with an error control of their own.
+Both are integrated by the extrapolated midpoint rule, with their own error control. The *costate*
+is the derivative of a result with respect to the state, the cotangent of reverse mode; its names
+contain ``slopes``. A *pairing* is its scalar product with the rates.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,14 +29,17 @@ from polhode._kernels import Distinct, attached, is_slope, kernel, linear, speci
 
 @runtime_checkable
 class Costate(Protocol):
-    """Equations of the slopes of a result, for states of special form.
+    """Adjoint equations for states of a special form, such as momentum and quaternion.
 
-    ``begin(y, slopes)``: the state z to integrate backwards from the end ``y``; ``rates(t, z,
-    args)``: dz/dt, and K (n,), whose slope by any of ``args`` is that of the result per unit time;
-    ``finish(z, start, end, slopes)``: the slopes by the start, ``slopes`` those at the end.
-    ``units(state_units, z, rates)``: weights of the components of z and the natural rate;
-    ``state_units`` gives those of the state. What these functions close over is traced only where
-    the field closes over traced values, too.
+    - ``begin(y, slopes)``: the variables z, integrated backwards from the state ``y`` at the end,
+      where the costate is ``slopes``;
+    - ``rates(t, z, args)``: dz/dt, and K (n,), whose derivative by any of ``args`` is the
+      contribution of that argument per unit time;
+    - ``finish(z, start, end, slopes)``: the costate at the start, for ``slopes`` at the end;
+    - ``units(state_units, z, rates)``: weights of the components of z and the natural rate;
+      ``state_units`` returns those of the state.
+
+    These functions may close over traced values only if the field does, too.
     """
 
     def begin(self, y: PyTree, slopes: PyTree) -> PyTree: ...
@@ -48,7 +54,7 @@ class Costate(Protocol):
 
 
 class AnyCostate(NamedTuple):
-    """Of any field f(c, t, y): z = (y, a), K = a . f, da/dt = -dK/dy."""
+    """Adjoint equations of any field f(c, t, y): z = (y, a), K = a . f, da/dt = -dK/dy."""
 
     field: Callable[..., list[Any]]
 
@@ -63,8 +69,8 @@ class AnyCostate(NamedTuple):
             k = sum(a * f for a, f in zip(slopes, rate))
             return jnp.sum(k), (rate, k)
 
-        # the state goes back with its slopes: a stored path would need memory for every step, and
-        # its interpolation would limit the accuracy
+        # The state is integrated backwards with the costate: to store the solution would take
+        # memory for every step, and its interpolation would limit the accuracy.
         change, (rate, k) = jax.grad(pairing, has_aux=True)(list(y))
         return [*rate, *(-x for x in change)], k
 
@@ -73,17 +79,20 @@ class AnyCostate(NamedTuple):
 
     def units(self, state_units, z, rates):
         half = len(z) // 2
-        # Slopes are measured in the inverse units of what they belong to. They may grow by orders
-        # of magnitude on the way, so that their errors are relative to their present size.
+        # The unit of a component of the costate is the inverse of that of the state's component.
+        # The costate may grow by orders of magnitude, so that errors are relative to its current
+        # size.
         weights, rate = state_units(z[:half], rates[:half])
         dual = [jnp.where(w > 0, 1 / jnp.where(w > 0, w, 1), 0) for w in weights]
         return [*weights, *relative(dual, z[half:], rates[half:], rate)], rate
 
 
 class FlatCostate:
-    """A costate on lists of arrays. ``direction_and_args(arrays)``: the direction of time, 1 or -1,
-    and the arguments. ``closes`` (static): whether its functions may close over traced values;
-    these are ``consts``, and the rates are traced at once, not where a derivative asks for them."""
+    """A ``Costate`` on flat lists of arrays.
+
+    ``direction_and_args(arrays)``: the direction of time, 1 or -1, and the arguments of the field.
+    ``closes`` (static): whether the functions of the costate may close over traced values. If so,
+    the rates are traced here rather than in a derivative, and these values are ``consts``."""
 
     def __init__(
         self,
@@ -141,19 +150,20 @@ class FlatCostate:
 
 
 _LOST = 1000
-"""By how many ``rtol`` the way back may miss the state at its start."""
+"""[rtol] Maximum error of the initial state that the backward integration reaches; with a larger
+one derivatives are NaN."""
 
 _LOST_BY_OTHERS = 1e-3
-"""The same of states found by other solvers, whose error is not known."""
+"""[1] The same for solutions of other solvers, whose error is not known."""
 
 _RESTING = 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5
-"""Momentum and quaternion of a body at rest."""
+"""Momentum and quaternion of a body at rest, in place of the state of a body that failed."""
 
 _RESTING_ANGLES = 0.5, 0.5, 0.5
-"""Euler angles of a body at rest, away from their poles; the momenta that follow are zero."""
+"""The same in Euler angles, away from their poles; the momenta that follow are zero."""
 
 _STEPS = 2**20
-"""Most steps of a derivative between two saved times."""
+"""Maximum number of steps of a derivative between two saved times."""
 
 
 def equations_of(
@@ -165,9 +175,9 @@ def equations_of(
     compensated: bool,
     keeps_rtol: bool = True,
 ) -> tuple["Equations", list[Array]]:
-    """The field on lists of arrays, and all arrays that it rests on.
+    """The field on flat lists of arrays, and the list c of all arrays on which it depends.
 
-    What the functions in ``args`` close over is among them: it may be differentiated.
+    It includes arrays over which functions in ``args`` close, since these may be differentiated.
     ``keeps_rtol``: whether the error of the saved states is below ``rtol``.
     """
     leaves, tree = jax.tree.flatten(y0)
@@ -217,8 +227,9 @@ def equations_of(
 class Equations:
     """A field f(c, t, y), and the derivatives of its solutions.
 
-    ``follow(c, y, t0, t1, horizon, end)``: ``end``, the solution at t1 found by other means, with
-    its derivatives; the whole way takes ``horizon``.
+    ``follow(c, y, t0, t1, horizon, end)`` attaches these derivatives to ``end``, the state at t1 of
+    the solution from ``y`` at t0, which was computed elsewhere; ``horizon``: duration of the whole
+    motion [s].
     """
 
     def __init__(self, jaxpr, counts, size, costate, control_tree, compensated, keeps_rtol):
@@ -228,8 +239,8 @@ class Equations:
         self.depends_on_time = uses(jaxpr, 0)
 
     def _parts(self, c: Sequence[Any]):
-        """What the field closes over, what the costate does, arguments of both, and how accurately
-        and in which units derivatives are integrated."""
+        """The four parts of c: the closed-over values of the field, those of the costate, the
+        arguments of both, and ``rtol`` with the natural units."""
         ends = np.cumsum(self.counts)
         return [list(c[i:j]) for i, j in zip((0, *ends), (*ends, len(c)))]
 
@@ -248,7 +259,8 @@ class Equations:
         return coefficients, run, by_entry
 
     def back(self, c: Sequence[Any], t, z: Sequence[Any]) -> tuple[list[Any], Any]:
-        """Rates of state and costate, and the scalar whose slope by ``c`` is integrated."""
+        """Rates of state and costate, and the pairing K, whose derivative by ``c`` is
+        integrated."""
         if isinstance(self.costate, AnyCostate):
             return self.costate.rates(c, t, z)
         return self.costate.at(*self._parts(c)[1:3], t, z)
@@ -257,9 +269,9 @@ class Equations:
         return attached(self._end_tangents, [t0, t1, horizon, *y, *c], end)
 
     def _end_tangents(self, operands, tangents, end):
-        """Change of the end for changes of the start, of both times and of the arguments."""
-        # Times need no integration: the end moves along its rates with t1, and against those of
-        # the start with t0.
+        """Tangent of the end for tangents of the start, of both times and of the arguments."""
+        # Derivatives by the times need no integration: the end moves along its rates with t1; a
+        # change of t0 is equivalent to a change of the initial state against the rates.
         (t0, t1, _), inputs = operands[:3], operands[3:]
         dt0, dt1, _ = tangents[:3]
         y, c = inputs[: self.size], inputs[self.size :]
@@ -270,7 +282,7 @@ class Equations:
             dy = [a - dt0 * f for a, f in zip(dy, self.field(c, t0, y))]
         maps = (partial(self._tangent, at), partial(self._cotangent, at))
         primals = [*operands[:3], *y, *end, *c]
-        # one unit of the steps and of what comes before and after them
+        # for few bodies one unit contains the integration and everything around it
         few = end[0].size <= _policy.KERNEL_BODIES
         compiled = partial(kernel, of_units=True) if few else None
         slopes = [*dy, *(dc[i] for i in at)]
@@ -285,7 +297,7 @@ class Equations:
         return (t0, t1), horizon, y, rest[: self.size], rest[self.size :]
 
     def _tangent(self, at, primals, tangents):
-        """Change of the end for changes of the start and of ``c[i]``, i in ``at``."""
+        """Tangent of the end for tangents of the start and of ``c[i]``, i in ``at``."""
         span, horizon, y, _, c = self._split(primals)
         dy, dc = tangents[: self.size], tangents[self.size :]
         constants, size = [*c, *dc], self.size
@@ -316,12 +328,13 @@ class Equations:
         return self._solve(c, rates, coefficients, z, [], span, horizon, units, by_entry)[0][size:]
 
     def _cotangent(self, at, primals, slopes):
-        """The transpose: slopes with respect to the start and to ``c[i]``."""
+        """The transpose: cotangents of the start and of ``c[i]``, from those of the end."""
         span, horizon, start, end, c = self._split(primals)
         rtol, natural_units = jax.tree.unflatten(self.control_tree, self._parts(c)[3])
         is_lie_poisson = isinstance(natural_units, LiePoissonUnits)
-        # A body that failed is followed from rest, as NaN would reach what all bodies share, and
-        # adds nothing: zero, or NaN where its slopes are NaN, as they are if no body finished.
+        # A body that failed is integrated from rest, because NaN would be added to cotangents that
+        # are common to all bodies. Its own contribution is zero, or NaN where its cotangents are
+        # NaN, as they are if no body finished.
         is_known = reduce(jnp.logical_and, map(jnp.isfinite, (*start, *end)))
         nothing = 0 * reduce(jnp.add, slopes)
         rest = [*(_RESTING if is_lie_poisson else _RESTING_ANGLES), *[0.0] * self.size]
@@ -341,10 +354,10 @@ class Equations:
                 ).coefficients
             )
 
-        # Each coefficient of the loop that depends on what is differentiated is one more integral
-        # to carry along. Folding makes products of them, which are more numerous than the numbers
-        # themselves, so the field is first taken apart without arithmetic. Only if some of these
-        # are not of the shape of the lanes is it folded after all.
+        # Each coefficient of the loop that depends on differentiated inputs takes one more
+        # integral. Folding replaces parameters by their products, which are more numerous; the
+        # field is therefore first specialised without arithmetic. It is folded only if some of the
+        # coefficients then do not have the shape of the lanes.
         parameters, lane = [c[i] for i in at], end[0].shape
         for fold in (False, True):
             coefficients, run, broadcast_shapes, _ = specialise(
@@ -357,7 +370,8 @@ class Equations:
             lambda *parameters: [coefficients_of(fold, *parameters)[i] for i in which], *parameters
         )
         del loop_coefficients
-        # a number that all bodies share gets a slope in each: no sum in the loop
+        # a coefficient common to all bodies has a cotangent for each body, so that the loop
+        # contains no sum
         is_lane = [broadcast_shapes[i] == {lane} for i in which]
         shapes = [
             lane if of_lane else jnp.shape(coefficients[i]) for i, of_lane in zip(which, is_lane)
@@ -378,8 +392,8 @@ class Equations:
             slopes, rates = jax.grad(pairing, argnums=argnums, has_aux=True)(*wide)
             return [*rates, *(-x for x in slopes)]
 
-        # The midpoint rule needs the integrands at every other point only (`Rates`): a field that
-        # leaves them out is a second program in the loop, and half the work of the integrals.
+        # The midpoint rule needs the integrands at every other point only (`Rates`). A second field
+        # without them, for the other points, halves the work of the integrals.
         with_integrals, without_integrals = (
             specialise(
                 jax.make_jaxpr(partial(adjoint, along=b))(*coefficients, span[0], *z), coefficients
@@ -410,8 +424,8 @@ class Equations:
             by_entry,
             individual_steps,
         )
-        # Backwards, what damping has drawn together runs apart: where the state found on the way
-        # has missed the start, the slopes found beside it mean nothing.
+        # Backwards, solutions that damping has drawn together diverge. If the backward integration
+        # does not reach the initial state, the costate is wrong as well, and becomes NaN.
         floor = natural_units.min_momentum**2 if is_lie_poisson else 0
         square_miss = sum((a - b) ** 2 for a, b in zip(z[:3], start[:3]))
         unit = sum((a * a + b * b for a, b in zip(start[:3], end[:3])), start=floor)
@@ -441,7 +455,7 @@ class Equations:
         individual_steps=True,
     ):
         """States and integrals at the end. ``units(state_units, y, rates)``: natural units of the
-        states; ``state_units`` gives those of the solution."""
+        integrated variables; ``state_units`` returns those of the state."""
         rtol, state_units = jax.tree.unflatten(self.control_tree, self._parts(c)[3])
         individual_steps = individual_steps and not self.depends_on_time
 

@@ -1,7 +1,7 @@
 """Integration loop of explicit Runge-Kutta steps: samples, events and a record of the steps.
 
-Bodies are the last axis of all arrays and have steps of their own. What happens in one turn of the
-loop: ``_turn.py``.
+Bodies are the last axis of all arrays; each takes its own steps. ``_turn.py`` contains the body of
+the loop; one iteration is called a *turn* in names.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,8 @@ from polhode._method import StepCounts
 
 
 class Solved(NamedTuple):
-    """Result of B bodies: see ``Progress`` and ``Storage``; None where no event is stored."""
+    """Results for B bodies: see ``Progress`` and ``Storage``. ``count`` and the fields after
+    ``samples`` are None if no events are stored."""
 
     steps: StepCounts
     outcome: Array
@@ -38,8 +39,8 @@ class Solved(NamedTuple):
 
 
 class Note(NamedTuple):
-    """Before a turn of the loop: state, levels, and the time since the start. What a turn leads to
-    stands in the note of the next one. Levels as ``packed`` leaves them."""
+    """Record of one iteration: state, levels (see ``packed``) and time since the start, before it.
+    The values after it are those of the next record."""
 
     y: Array
     levels: Array
@@ -47,7 +48,7 @@ class Note(NamedTuple):
 
 
 class StepRecord(NamedTuple):
-    """``notes`` of the first turns of the loop, the note after the last of all ``turns``, and the
+    """``notes`` of the first iterations; ``last``: the note after all ``turns`` iterations; and the
     ``outcome`` of each body."""
 
     notes: Note
@@ -57,15 +58,15 @@ class StepRecord(NamedTuple):
 
 
 Make = Callable[..., tuple[Motion, LoopOptions]]
-"""``make(arrays, unit_data, differentiable)``: the motion with coefficients from ``arrays``, errors
-measured by ``unit_data`` (units and ``rtol``), and the options."""
+"""``make(arrays, unit_data, differentiable)`` returns the equations of motion with coefficients
+from ``arrays``, and the options; ``unit_data``: natural units of the errors, and ``rtol``."""
 
 
 def solve(
     make: Make, arrays: Any, unit_data: Any, start: Array, ts: Array, y: Array, turns: int = 0
 ) -> tuple[Solved, StepRecord | None]:
     """Integrate from ``y`` (D, B) at ``start`` () or (B,) through ``ts`` (T,) or (B, T), with a
-    record of the first ``turns`` of the loop."""
+    record of the first ``turns`` iterations."""
     motion, options = make(arrays, unit_data, False)
     bodies = y.shape[1]
 
@@ -78,7 +79,7 @@ def solve(
         )
         no_events = (None,) * 4
         count, *events = (progress.count, *storage[1:]) if options.capacity else no_events
-        # the first attempt has no width
+        # the first attempt only evaluates the rates and is not a rejected step
         rejected_steps = jnp.maximum(progress.attempts - progress.steps - 1, 0)
         steps = StepCounts.of(
             progress.steps, rejected_steps, progress.at_switches, at_stability=progress.unstable
@@ -86,7 +87,7 @@ def solve(
         solved = Solved(steps, progress.outcome, progress.error, count, storage.samples, *events)
         return solved, record
 
-    # for more bodies a fused kernel takes four times as long to compile and is not faster
+    # For more bodies a fused kernel takes four times as long to compile and is not faster.
     is_unit = motion.is_whole and bodies <= _policy.KERNEL_BODIES
     integrate = kernel(integrate) if is_unit else integrate
     return integrate(
@@ -102,7 +103,7 @@ def run(
 
     def turn(carry):
         progress, storage, *record = carry
-        if turns:  # turns for which there is no room overwrite the last note
+        if turns:  # iterations beyond the capacity overwrite the last note
             count, notes = record
             record = count + 1, put_in(notes, count, noted(motion, progress))
         return *advance(motion, options, start, ts, progress, storage), *record
@@ -118,35 +119,37 @@ def run(
 
 
 def is_any_running(progress: Progress) -> Array:
-    """Whether any body goes on."""
+    """Whether any body is still running."""
     return any_of(jnp.where(progress.outcome == RUNNING, 1.0, 0.0))
 
 
 def noted(motion: Motion, progress: Progress) -> Note:
-    """What the derivative of a step needs to know of its start."""
+    """The values at the start of a step that its derivative needs."""
     return Note(progress.y, packed(motion, progress.levels), progress.elapsed)
 
 
 def packed(motion: Motion, levels: Array) -> Array:
-    """Levels (K, B) in an eighth of the memory: those of kinks are 0 or 1, those of jumps may be
-    any integer (``floor``). Records of a network of 64 relu would else be ten times the states."""
+    """Levels (K, B) as int8 if all are 0 or 1, an eighth of the memory of floats.
+
+    Levels of jumps may be any integer (``floor``) and stay floats. For a network of 64 relu, levels
+    as floats would take ten times the memory of the states."""
     return levels if motion.jumps else levels.astype(jnp.int8)
 
 
 def room_for(count: int, tree):
-    """Rows for ``count`` trees of the same shapes."""
+    """Zeros to store ``count`` trees like ``tree``, along a new leading axis."""
     return jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), tree)
 
 
 def put_in(rows, k: Array, tree):
-    """Rows with the tree as row ``k``."""
+    """``rows`` with ``tree`` stored as row ``k``."""
     return jax.tree.map(lambda r, x: jax.lax.dynamic_update_index_in_dim(r, x, k, 0), rows, tree)
 
 
 def begin(
     motion: Motion, options: LoopOptions, start: Array, ts: Array, y: Array
 ) -> tuple[Progress, Storage]:
-    """Carry and storage before the first step, which has no width and evaluates the rates."""
+    """Carry and storage before the first step, which has zero width and evaluates the rates."""
     zero = jnp.zeros_like(y[0])
     zero_counts = jnp.zeros(zero.shape, jnp.int32)
     levels = motion.levels(motion.arguments, start, y)
@@ -191,8 +194,8 @@ def each_body(start: Array, ts: Array, bodies: int) -> tuple[Array, Array]:
 
 
 class Search(NamedTuple):
-    """Events to search for: functions ``(wxyz, omega_body, t)``, the direction of each and whether
-    it ends the motion; ``capacity``: how many of a body are stored. All static."""
+    """Events to search for: their functions ``(wxyz, omega_body, t)``, the direction of each and
+    whether it ends the motion; ``capacity``: number of events stored for each body. All static."""
 
     fns: tuple[Callable[..., Array], ...] = ()
     directions: tuple[int, ...] = ()
@@ -201,14 +204,16 @@ class Search(NamedTuple):
 
     @property
     def passing(self) -> "Search":
-        """The same events, none of which is stored or ends the motion."""
+        """The same events, but none of them is stored or ends the motion."""
         return Search(self.fns, self.directions, (False,) * len(self.fns), 0)
 
 
 class Found(NamedTuple):
-    """Events of N bodies in the order of the motion: ``times`` (N, E) [s], inf where there is none,
-    ``which`` (N, E) event, ``side`` (N, E): 1 where its function is positive before it, or else -1;
-    ``count`` (N,): their number; ``rows`` (N, T): times of the samples."""
+    """Events of N bodies in the order of the motion.
+
+    ``times`` (N, E) [s], inf where there is none; ``which`` (N, E): index of the event function;
+    ``side`` (N, E): 1 where that function is positive before the event, else -1; ``count`` (N,):
+    number of events; ``rows`` (N, T + E): times of the samples and of the events."""
 
     times: Array
     which: Array
@@ -218,8 +223,8 @@ class Found(NamedTuple):
 
 
 def with_events(search: Search, solution: Solved, times: Array, states: Array):
-    """The events, and times (N, T + E) and states (N, T + E, D) of samples and events; samples
-    beyond a terminal event are that event."""
+    """The events, and the times (N, T + E) and states (N, T + E, D) of samples and events. Samples
+    after a terminal event are replaced by the time and state of that event."""
     bodies, capacity = solution.outcome.shape[0], search.capacity
     assert solution.times is not None
     assert solution.states_at_events is not None

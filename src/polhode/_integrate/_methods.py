@@ -1,4 +1,5 @@
-"""The methods that integrate: quaternions or Euler angles, and coarse steps for training."""
+"""Public integration methods: Lie-Poisson coordinates, Euler angles, and coarse steps for
+training."""
 
 import diffrax
 from jaxtyping import Array
@@ -27,10 +28,10 @@ class LiePoisson(AbstractIntegration):
     - ``progress_meter``: as in diffrax.
     - ``chart``: set by the planner (None: no preferred direction in space).
     - ``chunk``: number of bodies that are integrated together; chunks are processed one after the
-      other, which bounds the memory. None: 200 where the bodies of a chunk share their steps. For
-      ``Extrapolation``, in which each has its own, 1024, of which 64 are in progress at once, as
-      many as fit into the cache of a core; 64 where the field is more than arithmetic on the
-      numbers of one body; 2^18 on an accelerator.
+      other, which limits the memory. None: 200 if the bodies of a chunk have common steps. For
+      ``Extrapolation``, in which each body has steps of its own: 1024, of which 64 are in progress
+      at a time, as many as fit into the cache of a core; 64 if the field is more than elementwise
+      arithmetic (matrix products, for example); 2^18 on an accelerator.
     """
 
     def __init__(
@@ -63,13 +64,14 @@ class CoarseSteps(AbstractIntegration):
     """Explicit steps of order 5 that do not end where the field kinks or jumps: coarse and fast.
 
     For training, where a gradient with an error of a few per cent is enough and the controller has
-    many kinks (relu, clip): 2 to 20 times faster there than the default. The state keeps ``rtol``;
-    its derivative is wrong by about sqrt(rtol) at kinks, and by the whole contribution of the
-    switching time at jumps. Second derivatives through kinks or jumps raise NotImplementedError.
-    Unit quaternion and body momentum; derivatives are those of the steps, which are recorded.
+    many kinks (relu, clip): 2 to 20 times faster there than the default. The error of the state is
+    controlled by ``rtol``. Its derivative has an error of about sqrt(rtol) at kinks, and of the
+    whole contribution of the switching time at jumps. Second derivatives through kinks or jumps
+    raise NotImplementedError. Unit quaternion and body momentum; derivatives are those of the
+    steps, which are recorded.
 
-    **Arguments:** ``max_steps``: of each body; ``chunk``: number of bodies that are integrated side
-    by side (None: chosen).
+    **Arguments:** ``max_steps``: of each body; ``chunk``: number of bodies that are integrated
+    together (None: chosen).
 
         trajectory = ph.simulate(scene, states, ts, ph.CoarseSteps(), rtol=1e-4)
     """
@@ -88,8 +90,9 @@ class EulerAngles(AbstractIntegration):
     """Canonical ZYZ Euler angles by Hamilton's equations (docs/equations.md), any diffrax solver.
 
     For comparison: the coordinates are singular where theta is 0 or pi, which is reported as
-    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``. Bodies
-    are integrated one at a time if they would share steps, so that none waits for the worst.
+    ``Status.CHART_SINGULAR``; motions that pass close to it need many steps. Arguments as of
+    ``ph.LiePoisson``. With solvers whose steps are common to a chunk, bodies are integrated one at
+    a time, so that no body has to take the steps of another one.
     """
 
     def __init__(

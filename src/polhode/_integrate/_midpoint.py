@@ -1,21 +1,22 @@
 """Steps of the extrapolated midpoint rule from one time to another, with error control.
 
-The error of a step is found from its own table. Let e be the difference of the results of orders p
-and p - 2, and d that of p - 2 and p - 4. In a converging table the results' errors fall by about
-the same factor from one to the next, so that the result itself is off by about e^2 / d. Over random
-tops and gravity gradients with six decades of every parameter, orders 8 to 16 and steps of 0.3 to
-2.2 radians the true error was 2 to 20 times that, 4.5 times in the median, for errors from 1e-13 to
-1e-2 (``benchmarks/error_control.py``); e alone is too large by anything up to 1,000.
+The error of a step is estimated from its extrapolation table. Let e be the difference of the
+results of orders p and p - 2, and d that of orders p - 2 and p - 4. In a converging table the error
+falls by about the same factor from one result to the next, so that the error of the result of order
+p is about e^2 / d. For random tops and gravity gradients with six decades of every parameter,
+orders 8 to 16 and steps of 0.3 to 2.2 radians, the true error is 2 to 20 times as large, 4.5 times
+in the median, for errors from 1e-13 to 1e-2 (``benchmarks/error_control.py``). The difference e
+alone may exceed the error by a factor of up to 1,000.
 
-Where the rates do not depend explicitly on time each body has steps of its own, and finished bodies
-leave their SIMD lanes to the next (``in_lanes``). Otherwise the bodies share their times, so that
-what depends on time alone is evaluated once for all of them, and the body that needs the smallest
-step decides.
+If the rates do not depend explicitly on time, each body takes steps of its own, and the SIMD lane
+of a finished body is given to the next one (``in_lanes``). Otherwise the bodies have common steps,
+so that terms that depend on time alone are evaluated once for all of them; the body that needs the
+smallest step determines the width.
 
-Work queue: bodies that are integrated side by side as entries of arrays wait for the last of them.
-Of bodies with moments, weights and rates spread over decades, 64 side by side take 2.5 times the
-steps that they need, and tops of one shape 1.2 times. So the lanes hold the running bodies only;
-when a few have finished, their results are stored and the next bodies take their lanes.
+Work queue: bodies that are integrated at the same time, as entries of arrays, wait for the last one
+to finish. With moments, weights and rates spread over decades, 64 bodies at a time take 2.5 times
+the steps that they need, and tops of one shape 1.2 times. Therefore only running bodies are in the
+lanes: when a few have finished, their results are stored and the next bodies take their lanes.
 """
 
 from collections.abc import Callable
@@ -39,9 +40,9 @@ class Field(NamedTuple):
 
     ``rates(coefficients, t, y, along)``: see ``extrapolated``. ``units(unit_data, y, rates)``:
     weights of the components of an error, whose squares are summed, and the natural rate [rad/s].
-    ``individual_steps``: each body in steps of its own; the rates must then not depend on the time.
-    ``by_entry``: whether bodies can be exchanged for others by exchanging the entries of all these
-    arrays."""
+    ``individual_steps``: whether each body takes steps of its own; the rates must then not depend
+    on the time. ``by_entry``: whether a body can be replaced by another one by replacing its entry
+    in all of these arrays."""
 
     rates: Callable[..., tuple[list[Array], list[Array]]]
     units: Callable[..., tuple[list[Array], Array]]
@@ -51,8 +52,8 @@ class Field(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits of an integration: ``rtol``, the sum of errors [rad] at ``horizon`` [s] after its
-    start; ``steps``: their maximum; ``jumps`` (static): whether the rates may jump."""
+    """Limits of an integration: ``rtol``: the sum of errors [rad] at the time ``horizon`` [s] after
+    the start; ``steps``: their maximum number; ``jumps`` (static): whether the rates may jump."""
 
     rtol: Array
     horizon: Array
@@ -66,9 +67,10 @@ class Progress(NamedTuple):
     ``width``: of the next step [s], 0 if unknown; ``total_angle`` so far [rad]; ``compensation``:
     rounding errors of the state (compensated steps); ``steps``; ``rejections``; ``at_times``: steps
     shortened to end at a saved time; ``error``: sum of the estimated errors [rad]; ``elapsed``:
-    time since the first start [s]; ``reason``: 0, or why the body failed: 1 no steps are left, 2
-    the steps became too short, 3 likewise because the rates are not finite; ``rows``: states (n, T
-    + 1, C) at the times to be saved, where one call passes all of them; the last row is not used.
+    time since the first start [s]; ``reason``: 0, or why the body failed: 1: the maximum number of
+    steps is reached, 2: the steps became too short, 3: they did because the rates are not finite;
+    ``rows``: states (n, T + 1, C) at the saved times if one call integrates through all of them;
+    the last row of each body is a dummy row.
     """
 
     width: Array
@@ -100,8 +102,8 @@ class _Saved(NamedTuple):
 
     @classmethod
     def at_start(cls, rows: Array, save_times: Array, y: list[Array]) -> tuple["_Saved", Array]:
-        """Before the first step: what is saved at the start is the first state, all else is NaN,
-        whatever ``rows`` hold: to look at them takes longer than to write anew."""
+        """Before the first step: the initial state at saved times that are the start, and NaN at
+        all others. ``rows`` are overwritten, since this is faster than to read them."""
         is_start = save_times <= 0
         is_set = jnp.concatenate([is_start, jnp.zeros((1,), bool)])
         nan_rows = jnp.full_like(rows, jnp.nan)
@@ -113,8 +115,8 @@ class _Saved(NamedTuple):
     def update(
         self, is_due: Array, body: Array, save_times: Array, y: list[Array], rows: Array
     ) -> tuple["_Saved", Array]:
-        """With the states of the bodies that have reached their next time (``is_due``) stored in
-        ``rows`` (n (T + 1), C); the last row of each body is not used."""
+        """Store the states of the bodies that have reached their next saved time (``is_due``) in
+        ``rows`` (n (T + 1), C); the others write to their dummy row."""
         unused = save_times.shape[0]
 
         def once(carry):
@@ -125,7 +127,7 @@ class _Saved(NamedTuple):
             return _Saved(place, save_times.at[place].get(mode="clip")), rows, False
 
         any_due = any_of(is_due.astype(self.next_time.dtype))
-        # once or not at all: a branch would copy all that is saved
+        # a loop of one iteration or none, because a branch (``cond``) would copy all saved states
         return jax.lax.while_loop(lambda carry: carry[2], once, (self, rows, any_due))[:2]
 
 
@@ -140,7 +142,7 @@ class _Carry(NamedTuple):
     integrals: list[Array]
     width: Array
     last_error: Array  # logarithm of error over tolerance of the step before
-    rejected_step: tuple[Array, Array]  # error and width of a step refused
+    rejected_step: tuple[Array, Array]  # error and width; 0 after an accepted step
     total_angle: Array
     error: Array
     steps: Array
@@ -149,8 +151,8 @@ class _Carry(NamedTuple):
 
 
 class _Fixed(NamedTuple):
-    """Constants of the loop: ``data`` of the field; index of each body; why it failed before. As
-    part of the carry, constants may crash XLA."""
+    """Constants of the loop: ``data`` of the field; the index of each body; the reason why it
+    failed before, or 0. They are not part of the carry, in which constants may crash XLA."""
 
     data: Any
     body: Array
@@ -170,9 +172,9 @@ def integrate(
     """State and integrals at ``span[1]``, of bodies that are the entries of arrays of one shape.
 
     ``table_for(rate)``: the columns of a step, by the natural rates [rad/s] at the start. A body
-    that has used up ``limits.steps`` ends as NaN. ``save_times`` (T,): times since the start
-    [s] in order, the last that of the end, at which the states are to be saved, as the ``rows`` of
-    the progress: a body that has reached one goes on to its next without waiting for others.
+    that needs more than ``limits.steps`` ends as NaN. ``save_times`` (T,): sorted times since the
+    start [s], the last one that of the end, at which the states are saved in the ``rows`` of the
+    progress. A body that has reached one continues to its next without waiting for others.
     """
     compensated, individual_steps = bool(progress.compensation), field.individual_steps
     start, end = span
@@ -188,7 +190,7 @@ def integrate(
     power = 1 / (columns.order.astype(dtype) + 1)
 
     def worst(x, has_failed):
-        """Of the bodies that share their steps, but for those that are given up."""
+        """The maximum over bodies with common steps, without failed ones; otherwise ``x``."""
         return (
             x
             if individual_steps
@@ -196,7 +198,7 @@ def integrate(
         )
 
     def failed(constants, carry):
-        """Bodies whose steps ran out, or became so short that they lead nowhere."""
+        """Bodies that have used all their steps, or whose steps have become too short."""
         able = (carry.steps < limits.steps) & (carry.width > control.MIN_WIDTH * eps * length)
         return ~(able & (constants.reason == 0))
 
@@ -209,13 +211,13 @@ def integrate(
         return partial(field.rates, coefficients), partial(field.units, unit_data)
 
     def error_and_tolerance(rates, units, carry, t, h, width, end_state, result, end_rates):
-        """Error of a step, and what it may be."""
+        """Error of a step [rad], its tolerance, and the angle of the step [rad]."""
         (weights, rate), (end_weights, end_rate) = (
             units(carry.y, carry.rates),
             units(end_state, end_rates),
         )
-        # by the larger and faster of both ends: errors of a body that a torque sets in motion are
-        # not measured by its state at rest
+        # by the larger momentum and rate of both ends: otherwise errors of a body that a torque
+        # sets in motion would be measured in units of its state at rest
         weights = [jnp.minimum(a, b) for a, b in zip(weights, end_weights)]
         rate = jnp.maximum(rate, end_rate)
         difference, lower_difference = (
@@ -250,7 +252,7 @@ def integrate(
         tolerance = share * limits.rtol * angle / (expected * _drift(expected))
         rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
         tolerance = jnp.maximum(tolerance, rounding * eps)
-        sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
+        sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a long attempt may overflow
         error, tolerance = jnp.where(sound, error, jnp.inf), jnp.where(sound, tolerance, 1)
         return jax.lax.stop_gradient((error, tolerance, jnp.where(sound, angle, 0)))
 
@@ -260,13 +262,14 @@ def integrate(
         is_running = live(constants, carry)
         target_time = duration if carry.save_cursor is None else carry.save_cursor.next_time
         time_left = (target_time - carry.elapsed).astype(dtype)
-        # divide what remains evenly, so that no step is much shorter than its neighbours
+        # the remainder is divided in two so that the last step is not much shorter than the others
         width = jnp.where(
             time_left <= carry.width, time_left, jnp.minimum(carry.width, time_left / 2)
         )
         is_cut = width < control.CUT * carry.width  # shortened to end at a time, not by rounding
-        # the width is the difference of two representable times, or rounding would accumulate;
-        # rounded down after a refused step, which would otherwise be attempted again and again
+        # The width is the difference of two representable times; otherwise rounding would
+        # accumulate. After a rejected step it is rounded down: rounded up, it could be the same
+        # step again.
         end_time = carry.elapsed + width.astype(carry.elapsed.dtype)
         grain = jnp.finfo(end_time.dtype).eps * end_time  # one or two units in its last place
         exact = (end_time - carry.elapsed).astype(dtype)
@@ -290,14 +293,14 @@ def integrate(
         )
         ratio = worst(error / tolerance, failed(constants, carry))
         accepted = (ratio <= 1) & is_running
-        # logarithms: a power takes as long as three of them
+        # by logarithms: a power takes as long as three of them
         size = jnp.log(jnp.maximum(ratio, control.MIN_RATIO))
         memory = jnp.where(accepted, control.MEMORY * carry.last_error, 0)
         factor = control.SAFETY * jnp.exp(power * (memory - size))
         factor = jnp.clip(factor, control.MIN_FACTOR, control.MAX_FACTOR)
         if limits.jumps:
-            # the error of a step that a jump has shortened is rounding, which says nothing about
-            # the width that is possible
+            # The error of a step that a jump has shortened is rounding, which does not indicate the
+            # possible width.
             is_rounding = jnp.maximum(
                 angle / control.SHORT_STEP, error / (control.ROUNDED_STEP * eps)
             )
@@ -344,10 +347,10 @@ def integrate(
 
     body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
     constants = _Fixed(field.data, body, progress.reason)
-    # half of what a smooth motion allows, or everything at once if that is short
+    # half of what a smooth motion permits, or the whole duration if that is shorter
     guess = control.FIRST_WIDTH * limits.rtol.astype(dtype) ** power
     guess = guess / jnp.maximum(rate, 1 / (length + remaining))
-    guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are
+    guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are NaN
     guess = jax.lax.stop_gradient(guess)
     if not individual_steps:
         sound = jnp.where(
@@ -386,7 +389,7 @@ def integrate(
         )
         why = jnp.where(steps_remain, jnp.where(numbers, 2, 3), 1)
         reason = jnp.where(has_finished, 0, jnp.where(constants.reason > 0, constants.reason, why))
-        # as floats, like the other numbers
+        # a float, so that it can be stacked with the other numbers
         reason = reason.astype(dtype)
         steps = carry.steps, carry.attempts, carry.at_times
         numbers = carry.width, carry.total_angle, *steps, carry.error, reason
@@ -421,13 +424,15 @@ def integrate(
 
 
 def _drift(angle: Array) -> Array:
-    """Reduction of the tolerance: the power 3/4 of the angle, by square roots, which are faster."""
+    """Divisor of the tolerance: the power 3/4 of the angle over ``DRIFT_ANGLE``, by square roots,
+    which are faster than a power."""
     ratio = jnp.maximum(angle / control.DRIFT_ANGLE, 1)
     return jnp.sqrt(ratio * jnp.sqrt(ratio))
 
 
 def _select_integrals(accepted, candidates, integrals):
-    """Integrals with a shape that all bodies share are accepted with the step that they share."""
+    """Integrals after accepted steps. An integral over all bodies, of another shape, is accepted
+    with the step that the bodies have in common."""
     return [
         jnp.where(accepted if x.shape == accepted.shape else jnp.any(accepted), x, y)
         for x, y in zip(candidates, integrals)
@@ -435,13 +440,14 @@ def _select_integrals(accepted, candidates, integrals):
 
 
 def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
-    """Error by rates that jump beside an end of a step, unseen by its estimate.
+    """Error by rates that jump close to an end of a step, which the error estimate cannot detect.
 
-    No column of the midpoint rule looks between either end of a step and its first or last
-    substep but at the end itself, and steps that are refused again and again near a jump end up
-    with it there. Along a straight line, the tangent at the start or the chord at the end,
-    differences of smooth rates fall with their order; those of rates that jump do not. The rates
-    of a free body are quadratic there, so that a weak jump shows from the third difference on.
+    The midpoint rule does not evaluate the rates between an end of a step and its first or last
+    substep, and repeated rejections near a jump shorten the step until the jump lies there. Here
+    the rates are sampled along a straight line, the tangent at the start or the chord at the end.
+    Differences of smooth rates fall with their order; those of rates that jump do not. On such a
+    line the rates of a free body are quadratic in the distance, so that third and fourth
+    differences show a weak jump.
     """
     gap = control.JUMP_GAP * width
     eps = float(jnp.finfo(width.dtype).eps)
@@ -450,18 +456,19 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
         return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
 
     def add_end(end, total):
-        """One end: 0, the start, or 1. In loops, so that the rates stand in the program once."""
+        """Add the error at one end: 0, the start, or 1. Loops over ends and samples, so that the
+        program contains the rates once."""
         at_end = end == 1
         base, base_rates = pick(at_end, carry.y, end_state), pick(at_end, carry.rates, end_rates)
-        # along the tangent at the start, back along the chord at the end
+        # forward along the tangent at the start, backward along the chord at the end
         chord = [a - b for a, b in zip(carry.y, end_state)]
         part = [gap * f for f in carry.rates]
         part = pick(at_end, part, [control.JUMP_GAP * x for x in chord])
         start, sign = jnp.where(at_end, t + width, t), jnp.where(at_end, -1, 1)
 
         def further(k, result):
-            """Differences of order 0, 1, ... up to the rates ``k`` times so far; the sizes of
-            those from the end on, of which the one of order ``k`` is new."""
+            """Backward differences of order 0, 1, ... at sample ``k``, and the sizes of those of
+            order 3 and 4, each taken at the sample of its own order."""
             older_rows, sizes = result
             k = k.astype(width.dtype)
             time = (start + sign * k * gap).reshape(-1)[0]
@@ -493,15 +500,21 @@ def in_lanes(
     carry: Any,
     rows: Any,
 ) -> tuple[Any, Any]:
-    """``finish(constants, carry)`` of every body after its last step, and the ``rows``.
+    """Integrate a queue of n bodies in a fixed number of lanes, which are refilled.
 
-    ``step(constants, carry, rows)``: ``carry`` and ``rows`` after one step of some bodies.
-    ``can_step(constants, carry)`` (n,): whether a body continues; False if its ``carry`` is zero.
-    ``carry``: arrays (n,); ``constants``: such arrays and numbers that no step changes, among them
-    ``constants.body`` (n,), the index of each body; ``rows``: anything that belongs to all bodies.
+    Returns ``finish(constants, carry)`` of every body after its last step, and the ``rows``.
+
+    - ``step(constants, carry, rows)``: ``carry`` and ``rows`` after one step of the bodies in the
+      lanes;
+    - ``can_step(constants, carry)``: whether each body continues; False if its ``carry`` is zero;
+    - ``carry``: arrays (n,);
+    - ``constants``: arrays (n,) and numbers that no step changes, among them ``constants.body``,
+      the index of each body;
+    - ``rows``: data common to all bodies, such as saved states.
     """
     n = constants.body.size
-    wide = -(-n // -(-n // _policy.LANES))  # no wider than where each lane leads as many bodies
+    # no more lanes than needed for the same number of bodies in each lane, a multiple of 8
+    wide = -(-n // -(-n // _policy.LANES))
     wide += -wide % 8
     parts, tree = jax.tree.flatten(constants)
     constant = [x for x in parts if x.shape == (n,)]
@@ -510,12 +523,12 @@ def in_lanes(
     queue = _stacked(constant), _stacked(changing)
 
     def constants_of(fixed_rows):
-        """What is fixed of the bodies in the lanes."""
+        """The constants of the bodies in the lanes."""
         lane_rows = iter(_as(constant, fixed_rows))
         return jax.tree.unflatten(tree, [next(lane_rows) if x.shape == (n,) else x for x in parts])
 
-    def settle(loop):
-        """What became of the bodies that have arrived is stored, and others take their lanes."""
+    def refill(loop):
+        """Store the results of the finished bodies and refill their lanes."""
         fixed_rows, carry, results, next_body, _ = loop
         constants = constants_of(fixed_rows)
         is_finished = ~can_step(constants, carry)
@@ -529,7 +542,8 @@ def in_lanes(
         start = jax.tree.unflatten(form, _as(changing, start))
         carry = jax.tree.map(lambda a, b: jnp.where(is_refilled, a, b), start, carry)
         count = jnp.sum(jnp.where(is_finished, 1, 0))
-        # n: none is waiting; n + 1: all have been stored, and stay so while others of a batch go on
+        # n: the queue is empty; n + 1: all results are stored, and do not change while other queues
+        # of a batch continue (under ``vmap``)
         is_last = (count == wide) & (next_body >= n)
         next_body = jnp.where(is_last, n + 1, jnp.minimum(next_body + count, n))
         return jnp.where(is_refilled, others, fixed_rows), carry, results, next_body, False
@@ -538,13 +552,13 @@ def in_lanes(
         fixed_rows, carry, results, next_body, rows = loop
         idle = jnp.sum(jnp.where(can_step(constants_of(fixed_rows), carry), 0, 1))
         needs_refill = (idle >= _policy.REFILL_LANES) & (next_body < n) | (idle == wide)
-        # once or not at all: a branch would copy all that it may change
+        # a loop of one iteration or none, because a branch (``cond``) would copy all its results
         start = fixed_rows, carry, results, next_body, any_of(jnp.where(needs_refill, 1.0, 0.0))
-        fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], settle, start)
+        fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], refill, start)
         carry, rows = step(constants_of(fixed_rows), carry, rows)
         return fixed_rows, carry, results, next_body, rows
 
-    # at first every lane is done with a body of zeros, whose end is overwritten
+    # At the start every lane has a finished body of zeros; its results are overwritten later.
     fixed_rows, start = (jnp.zeros((len(x), wide), x.dtype) for x in queue)
     carry = jax.tree.unflatten(form, _as(changing, start))
     results = jnp.zeros_like(_stacked(endings).T)
@@ -556,13 +570,13 @@ def in_lanes(
 
 
 def _stacked(arrays: list[Array]) -> Array:
-    """Arrays as the rows of a matrix: it is looked up in one loop, which compiles faster than one
-    for each. Integers, numbers of bodies and small ones, are exact as floats."""
+    """Arrays as the rows of a matrix: one gather from it compiles faster than one for each array.
+    Integers (indices of bodies and small numbers) are exact as floats."""
     floats = [x.dtype for x in arrays if jnp.issubdtype(x.dtype, jnp.floating)]
     widest = max(floats, key=lambda dtype: dtype.itemsize)
     return jnp.stack([x.astype(widest) for x in arrays])
 
 
 def _as(like: list[Array], rows: Array) -> list[Array]:
-    """The rows of a matrix as what was stacked, which may have been integers."""
+    """The rows of a matrix with the dtypes of the arrays that were stacked."""
     return [row.astype(x.dtype) for x, row in zip(like, rows)]

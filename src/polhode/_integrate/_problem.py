@@ -1,4 +1,5 @@
-"""A scene as the motion of single bodies: the field of one body, its switches, and all arrays."""
+"""The equations of motion of a scene as a program for one body, its switches, and the arrays of all
+bodies."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -16,16 +17,19 @@ from polhode._integrate._tableau import Tableau
 from polhode._kernels import Distinct, formula, is_holdable, specialise
 
 Pose = Callable[[Any], tuple[Any, Any]]
-"""From the parts of one body, arrays with one lane, to the term of its equations and arguments."""
+"""From the parts of a scene, with the arrays of one body (lane axis of length 1), to the diffrax
+term of its equations and the term's arguments."""
 
 
 class Problem(NamedTuple):
     """The field of one body as a program of arrays.
 
-    ``closed_jaxpr``: rates (and sides of events) of ``arrays``, the time and the state components;
-    ``arrays``: those of B bodies (B, ...) where ``lanes`` says so, else shared; ``switches``;
-    ``events``: how many of the last switches are events; ``passed_switches``: how many switches
-    the steps pass without ending there; ``specialised``: what ``motion`` has traced, if it has.
+    - ``closed_jaxpr``: rates (and signs of event functions) as a function of ``arrays``, the time
+      and the components of the state;
+    - ``arrays``: (B, ...) for B bodies where ``lanes`` is true, otherwise common to all;
+    - ``switches``: of the program; the last ``events`` of them are events;
+    - ``passed_switches``: number of switches at which steps do not end (``ph.CoarseSteps``);
+    - ``specialised``: the programs traced by ``motion``, once it has been called.
     """
 
     closed_jaxpr: ClosedJaxpr
@@ -49,11 +53,12 @@ class Problem(NamedTuple):
         watch: Any = None,
         located: bool = True,
     ):
-        """``parts``: arrays of all bodies, ``is_lane``: a tree of which have a lane axis; ``y0``: a
-        state, components (B,); ``watch(parts, t, y)``: values (E,) of events, of one body;
-        ``located``: False: the switches are passed, and only counted."""
-        # An array that stands in several parts of the scene (an orbit in potential and torque) is
-        # one operand: otherwise what depends on it would be computed as often as it occurs.
+        """``parts``: arrays of all bodies; ``is_lane``: a tree of truth values, whether each has a
+        lane axis; ``y0``: a state with components (B,); ``watch(parts, t, y)``: values (E,) of the
+        event functions of one body; ``located``: whether steps end at switches; if not, they are
+        only counted."""
+        # An array that occurs in several parts of the scene (an orbit in potential and torque) is
+        # one operand; otherwise values that depend on it would be computed several times.
         parts_and_lanes = jax.tree.map(_Marked, parts, is_lane)
         leaves, tree = jax.tree.flatten(parts_and_lanes, is_leaf=lambda x: isinstance(x, _Marked))
         arrays = [x.value for x in leaves if eqx.is_array(x.value)]
@@ -82,8 +87,8 @@ class Problem(NamedTuple):
                 return rates
             event_values = watch(parts, t, y)
             events = event_values.size
-            # a comparison, so that events are found as switches are; it moves with the time even if
-            # the function of the event does not
+            # A comparison, so that events are located as switches are. The term 0 * t makes it
+            # vary with the time, even if the event function does not.
             return [*rates, jnp.where(event_values + 0 * t >= 0, 1, 0)]
 
         single_lane = [x[0] if lane else x for x, lane in zip(once, flags)]
@@ -113,7 +118,7 @@ class Problem(NamedTuple):
 
     @property
     def note_bytes(self) -> int:
-        """Memory of what is recorded of a body before a turn of the loop (``Note``)."""
+        """Memory of the record of one body and one iteration of the loop (``Note``)."""
         number = jnp.dtype(self.dtype).itemsize
         level = number if self.switches.jumps.any() else 1
         return number * (self.components + 1) + level * self.switches.count
@@ -129,18 +134,19 @@ class Problem(NamedTuple):
         """Equations of motion for the loop; ``units(unit_data, y, rates)``: see ``Motion``;
         ``differentiable``: whether JAX differentiates the loop itself."""
         size, count = self.components, self.switches.count
-        if not self.specialised:  # once: derivatives ask for the same motion of other arrays
+        if not self.specialised:  # traced once: derivatives call ``motion`` with other arrays
             self.specialised.append(self._specialised())
         prepared, field, kinds = self.specialised[0]
         prepare, run = jaxpr_as_fun(prepared), jaxpr_as_fun(field)
-        # In a stack one array with a tangent would give all of them one.
+        # If JAX differentiates the loop, arrays are not stacked: a tangent of one of them would
+        # become one of the whole stack.
         stacks = _Stacks([(*kind, i) for i, kind in enumerate(kinds)] if differentiable else kinds)
 
         def coefficients_of(*parameters):
             return stacks.of(prepare(*parameters))
 
-        # What is the same for all bodies is computed once and gets no axis: the weights of a
-        # network would otherwise be copied for every body.
+        # Values that are the same for all bodies are computed once and get no batch axis: the
+        # weights of a network would otherwise be copied for every body.
         axes = [0 if lane else None for lane in self.lanes]
         out = [0 if moves else None for moves, *_ in stacks.kinds]
         coefficients = (
@@ -149,8 +155,8 @@ class Problem(NamedTuple):
             else coefficients_of()
         )
 
-        # The field of one body under `vmap`, not one written for lanes: user functions with matrix
-        # products become one product for all bodies of a chunk.
+        # `vmap` of the field of one body, rather than the field written for lanes, makes one matrix
+        # product for all bodies of a chunk out of a product in a user's function.
         def of_one(coefficients, levels, t, y):
             *rates, margins, new_levels = run(
                 *stacks.apart(coefficients), levels, t, *(y[i][None] for i in range(size))
@@ -191,7 +197,8 @@ class Problem(NamedTuple):
         )
 
     def _specialised(self) -> "_Specialised":
-        """The program of one body, divided into what moves and what does not."""
+        """The program of one body, divided into the part that is constant during the motion and the
+        part that depends on levels, time and state."""
         size = self.components
         avals = self.closed_jaxpr.in_avals[: -1 - size]
         fixed_count = len(avals)
@@ -225,9 +232,10 @@ class Problem(NamedTuple):
 
 
 class _Specialised(NamedTuple):
-    """``prepared``: from the arrays of one body to all that does not move; ``field``: from this,
-    levels, time and state to rates, margins and new levels; ``kinds`` of the results of the former:
-    whether each has a value for each body, its shape and dtype."""
+    """``prepared``: from the arrays of one body to the coefficients, which are constant during the
+    motion; ``field``: from the coefficients, levels, time and state to rates, margins and new
+    levels; ``kinds``: for each coefficient, whether it differs between bodies, its shape and
+    dtype."""
 
     prepared: ClosedJaxpr
     field: ClosedJaxpr
@@ -240,8 +248,8 @@ class _Marked(NamedTuple):
 
 
 class _Stacks:
-    """Arrays of one kind as one array: the loop carries few in place of fifty, and XLA compiles it
-    in less time."""
+    """Stacks of arrays of the same kind: the loop carries a few arrays instead of fifty, and XLA
+    compiles it in less time."""
 
     def __init__(self, kinds: Sequence[Any]):
         self.kinds = list(dict.fromkeys(kinds))
@@ -249,7 +257,7 @@ class _Stacks:
         self.count = len(kinds)
 
     def of(self, arrays: Sequence[Any]) -> list[Any]:
-        """One array for each kind; one that is alone as it is."""
+        """One stack for each kind; a single array of its kind is not stacked."""
         return [
             jnp.stack([arrays[i] for i in members]) if len(members) > 1 else arrays[members[0]]
             for members in self.members
@@ -259,7 +267,8 @@ class _Stacks:
         """The arrays in their order."""
         arrays: list[Any] = [None] * self.count
         for stack, members in zip(stacks, self.members, strict=True):
-            # The cotangent of a split is one concatenation, that of an index a padded array each.
+            # The cotangent of a split is one concatenation; that of indexing is one padded array
+            # for each index.
             parts = (
                 [x[0] for x in jax.lax.split(stack, [1] * len(members))]
                 if len(members) > 1
@@ -273,7 +282,8 @@ class _Stacks:
 def _with_consts_as_operands(
     closed_jaxpr: ClosedJaxpr, variable_count: int
 ) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program of (what it closes over, arrays, what moves), and what it closes over."""
+    """The program with its closed-over values as first operands and the first ``variable_count``
+    operands (time and state) as last ones; and the closed-over values."""
     jaxpr = closed_jaxpr.jaxpr
     invars = [*jaxpr.constvars, *jaxpr.invars[variable_count:], *jaxpr.invars[:variable_count]]
     names = jaxpr.debug_info._replace(arg_names=("",) * len(invars))
@@ -283,7 +293,7 @@ def _with_consts_as_operands(
 
 
 def _depends(jaxpr, flags: Sequence[bool]) -> list[bool]:
-    """Which results of a program rest on the arguments with a flag."""
+    """Which results of a program depend on the arguments with a true flag."""
     dependent_vars = {v for v, flag in zip(jaxpr.invars, flags) if flag}
     for eqn in jaxpr.eqns:
         if any(not isinstance(v, Literal) and v in dependent_vars for v in eqn.invars):

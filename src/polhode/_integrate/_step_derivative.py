@@ -1,19 +1,21 @@
 """Derivatives of the steps of ``_turn.py``, in both modes, through the switches that end them.
 
-With the levels held a step is a smooth map, and its derivative is that of an ordinary Runge-Kutta
-step of fixed width. Where a switch turns at the time tau, the rates change from f to f', and a
-small change of the state before it, which shifts tau by d tau, adds ``(f - f') d tau`` to the
-change after it (the saltation of piecewise smooth systems: M. di Bernardo et al., Piecewise-smooth
-Dynamical Systems (2008), section 2.5). Without this term derivatives through a jump are wrong at
-any step width, and those through a kink by about the square root of the tolerance.
+With fixed levels a step is a smooth map, and its derivative is that of an ordinary Runge-Kutta step
+of fixed width. At a switch, at the time tau, the rates change from f to f'. A small change of the
+state before the switch shifts tau by d tau, and thereby adds ``(f - f') d tau`` to the change of
+the state after it (the saltation term of piecewise smooth systems: M. di Bernardo et al.,
+Piecewise-smooth Dynamical Systems (2008), section 2.5). Without this term derivatives through a
+jump are wrong at any step width, and those through a kink by about the square root of the
+tolerance.
 
-*Forward mode* differentiates the loop, with the place of each switch by two steps of Newton's rule.
-*Reverse mode* passes recorded steps (state, levels and time) in reverse order. The first
-``RECORDED_TURNS`` are recorded where the values are computed. If there are more, the motion is
-integrated once more: the attempts that are allowed are divided into ``RECORD_SEGMENTS`` equal
-segments, the carry of the loop is stored at the start of each, there is room for the records of
-one, and those before the last one are integrated a third time. Full records of all steps would take
-100 times the memory; a checkpoint at every 16th step takes one more integration of all.
+*Forward mode* differentiates the loop; the time of each switch gets its derivative from two steps
+of Newton's method. *Reverse mode* processes recorded steps (state, levels and time) in reverse
+order. The first ``RECORDED_TURNS`` iterations of the loop are recorded while the values are
+computed. If there are more, the motion is integrated once more: the maximum number of attempts is
+divided into ``RECORD_SEGMENTS`` equal segments, and the carry of the loop is stored at the start of
+each (checkpoint). Only one segment is recorded at a time, so that all segments but the last are
+integrated a third time. Full records of all steps would take 100 times the memory; a checkpoint at
+every 16th step would take one more integration of all steps.
 """
 
 from collections.abc import Callable
@@ -66,10 +68,12 @@ def samples(
     turns: int = 0,
     once: bool = False,
 ) -> tuple[Array, Solved]:
-    """``states`` (B, T, D), samples at ``ts`` (T,) or (B, T) of the motion from ``y`` (D, B) at
-    ``start`` () or (B,), with their derivatives, and ``solved``. Times of one body may stand in any
-    order. Where derivatives are taken and ``turns`` is not zero, both are results of an integration
-    that records the first ``turns`` of the loop. ``once``: refuse second derivatives."""
+    """``states`` with their derivatives, and ``solved``.
+
+    ``states`` (B, T, D): samples at ``ts`` (T,) or (B, T), in any order, of the motion from ``y``
+    (D, B) at ``start`` () or (B,). In a program that computes derivatives and with ``turns``, both
+    come from an integration that records the first ``turns`` iterations. ``once``: raise an error
+    for second derivatives."""
     leaves, tree = jax.tree.flatten(unit_data)
     size, end = len(arrays), len(arrays) + len(leaves)
 
@@ -90,7 +94,7 @@ def samples(
         starts, rows = each_body(start, ts, y.shape[1])
         order = None
         states, ordered_ts = values[0], ts
-        # `Trajectory.at` may ask for times of a body in any order; the loop goes one way.
+        # The times of a body may be in any order (`Trajectory.at`); the loop needs them sorted.
         if ts.ndim > 1:
             sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
             order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
@@ -98,8 +102,8 @@ def samples(
             states = jnp.take_along_axis(states, order[..., None], axis=1)
         at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
         dy = dy if is_slope(dy) else zeros(dy)
-        # A later start is a start from a state that has gone back along the rates, and a later
-        # sample has gone on along them: no integration for either.
+        # Derivatives by times need no integration: a change of the start time is equivalent to a
+        # change of the initial state against the rates, and a sample moves along the rates.
         if is_slope(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         recorded, record_tree = jax.tree.flatten(record)
@@ -138,7 +142,7 @@ def samples(
 
 
 def segment_turns(max_steps: int) -> int:
-    """Turns of the loop from one checkpoint to the next."""
+    """Iterations of the loop from one checkpoint to the next."""
     return -(-control.ATTEMPTS * max_steps // _policy.RECORD_SEGMENTS)
 
 
@@ -147,7 +151,8 @@ def _is_differentiated(operands) -> bool:
 
 
 def _checked(operands, once: bool):
-    """The operands of a derivative; raises where ``once`` and they are differentiated again."""
+    """The operands of a derivative; raises an error if ``once`` and they are differentiated
+    again."""
     if once and _is_differentiated(operands):
         raise NotImplementedError(
             "second derivatives of steps that pass kinks or jumps are wrong: leave"
@@ -193,7 +198,7 @@ def _cotangent(problem_of, at, primals, record, cotangents):
     cotangents = jnp.moveaxis(cotangents, 0, -1)  # (T, D, B)
     parameters = [arrays[i] for i in at]
 
-    # Second derivatives need those of the places of switches; the record has none.
+    # Second derivatives need derivatives of the times of switches, which the record does not have.
     differentiable = _is_differentiated(primals)
     record = None if differentiable else record
 
@@ -206,9 +211,9 @@ def _cotangent(problem_of, at, primals, record, cotangents):
 
     motion, options = problem_of(arrays, differentiable)
     floats = [k for k, x in enumerate(motion.coefficients) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    # Cotangents are summed over steps and bodies where they arise, for the coefficients of the
-    # loop (a network's weights once, not once for each body), and pulled back to the parameters
-    # once at the end.
+    # Cotangents of the loop's coefficients are summed over steps and bodies as they arise, so that
+    # weights of a network common to all bodies have one cotangent. At the end they are pulled back
+    # to the parameters, once.
     _, pull = jax.vjp(coefficients_of, *parameters)
     sums = [jnp.zeros_like(motion.coefficients[k]) for k in floats]
 
@@ -239,9 +244,10 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     length = segment_turns(options.max_steps)
 
     def stored(progress):
-        """Checkpoint: rates and margins are evaluated again where a segment starts, on both
-        passes, so that both take the same steps. The rest is one array and the levels, as each
-        array of a checkpoint is three operations in every turn."""
+        """The carry as a checkpoint, without rates and margins. These are evaluated again at the
+        start of a segment, in both integrations, so that both take the same steps. All numbers are
+        in one array, because each array of a checkpoint takes three operations in every
+        iteration."""
         numbers = [progress._asdict()[name].astype(y.dtype) for name in _NUMBERS]
         levels, just_turned = (packed(motion, x) for x in (progress.levels, progress.just_turned))
         return jnp.concatenate([progress.y, jnp.stack(numbers)]), levels, just_turned
@@ -276,16 +282,17 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
         return progress, checkpoints, notes, count + 1
 
     def sound(finished, note):
-        # Where a body failed the rates may be NaN, and zero cotangents times NaN would reach
-        # coefficients shared with bodies that finished: the state of one of these in its place.
-        index = jnp.arange(finished.shape[0])  # not argmax, which a fused kernel cannot hold
+        # The rates of a body that failed may be NaN, and zero cotangents times NaN would be added
+        # to coefficients shared with other bodies. Its state is replaced by that of a body that
+        # finished.
+        index = jnp.arange(finished.shape[0])  # not argmax, which a fused kernel cannot contain
         finished_body = jnp.min(jnp.where(finished, index, finished.shape[0] - 1))
         return jax.tree.map(
             lambda x: jnp.where(finished, x, x[..., finished_body][..., None]), note
         )
 
-    # The first segment that is passed in reverse order is the last one. The same loop integrates
-    # until the end in order to record it, and again each of those before it from its checkpoint.
+    # In its first iteration this loop integrates to the end of the motion, and processes the last
+    # segment. In the following ones it integrates earlier segments again, each from its checkpoint.
     def segment(carry):
         number, count, stop, checkpoints, notes, finished, after, later, *sums_so_far = carry
         progress, checkpoints, notes, count = jax.lax.while_loop(
@@ -317,11 +324,11 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     note = noted(motion, first_progress)
     notes, count = room_for(length, note), jnp.zeros((), jnp.int32)
     if record is not None:
-        # A record of all turns: the loop finds that every body has stopped, and takes none.
+        # If all iterations are recorded, integration starts with every body stopped and takes none.
         room = record.notes.elapsed.shape[0]
         is_complete = most_of(record.turns) <= room
-        # Under ``vmap`` bodies may have been integrated a part at a time, each with turns of its
-        # own: after these they stand still, while others go on.
+        # Under ``vmap``, chunks of bodies may have been integrated one after another, with
+        # different numbers of iterations. After its last iteration a chunk does not change.
         recorded_turns = jnp.where(is_complete, record.turns, _NEVER)
         notes = jax.tree.map(lambda x, r: jnp.concatenate([r, x[room:]]), notes, record.notes)
         count = jnp.where(is_complete, most_of(record.turns), 0)
@@ -346,7 +353,7 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     )
     carry = jax.lax.while_loop(lambda c: c[2] > 0, segment, carry)
     *_, finished, _, _, cotangent, sums, _ = carry
-    # NaN, not zero, where the cotangents are: no body of the whole call finished
+    # zero, or NaN where the cotangents are NaN, as they are if no body of the call finished
     nothing = 0 * jnp.sum(cotangents[0] + cotangents[-1], axis=0)
     any_finished = jnp.sum(jnp.where(finished, 1, 0)) > 0
     return (
@@ -356,11 +363,11 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
 
 
 _NEVER = jnp.iinfo(jnp.int32).max
-"""A number of turns that no motion takes."""
+"""A number of iterations that no motion takes."""
 
 _ARRAYS = "y", "rate", "levels", "margin", "just_turned"
 _NUMBERS = tuple(name for name in Progress._fields if name not in _ARRAYS)
-"""Fields of the carry of the loop that are one number of each body."""
+"""Fields of the carry of the loop that are one number for each body."""
 
 
 def _step_back(
@@ -377,17 +384,18 @@ def _step_back(
     sums,
     place,
 ):
-    """From cotangents after a turn of the loop to those before it. ``later``: levels with which the
-    motion goes on from ``after``, once those are corrected that depend on the one that has turned
-    (of a search in a table every comparison but the first); ``place`` (B,): index of the last
-    sample that has not been passed yet."""
+    """From cotangents after an iteration of the loop to those before it.
+
+    ``later``: the levels with which the motion continues from ``after``, including corrections of
+    levels that depend on the switch that turned (of a search in a table every comparison but the
+    first); ``place`` (B,): index of the last sample that has not been processed yet."""
     levels = note.levels.astype(cotangent.dtype)
     sign = jnp.where(times[-1] < start, -1, 1).astype(cotangent.dtype)
     t = start + sign * note.elapsed
     h = sign * (after.elapsed - note.elapsed)
     has_turned = jnp.any(note.levels != after.levels, axis=0)
-    # Past a switch beyond which the field is undefined on the side held, the state moves without a
-    # step: see `_snap` in `_turn.py`.
+    # At a switch beyond which the field is undefined, the state moves without a step: see `_snap`
+    # in `_turn.py`.
     length, eps = jnp.abs(times[-1] - start), float(jnp.finfo(cotangent.dtype).eps)
     is_snap = has_turned & (jnp.abs(h) <= 2 * snap_reach(note.elapsed, length, eps))
     live = finished & ((h != 0) | has_turned)
@@ -418,9 +426,10 @@ def _step_back(
         any_of(jnp.where(has_sample(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1
     )
 
-    # The stages are evaluated again from the state: to record them would take as many times the
-    # memory as there are stages. What their derivatives need is kept, since a third evaluation
-    # takes a tenth to a sixth of the time of gradients through networks.
+    # The stages are evaluated again from the state, because a record of them would multiply the
+    # memory by their number. The residuals of their derivatives are stored for this step: to
+    # evaluate the stages a third time would take a tenth to a sixth of the time of gradients
+    # through networks.
     rebuild: list[Callable] = []
 
     def linearised(i, rates):
@@ -433,16 +442,16 @@ def _step_back(
         return rate, arrays
 
     def stage(i, carry):
-        rates, kept = carry
+        rates, residuals = carry
         rate, arrays = linearised(i, rates)
         put_in = jax.lax.dynamic_update_index_in_dim
-        kept = [put_in(rows, x, i, 0) for rows, x in zip(kept, arrays, strict=True)]
-        return put_in(rates, rate, i, 0), kept
+        residuals = [put_in(rows, x, i, 0) for rows, x in zip(residuals, arrays, strict=True)]
+        return put_in(rates, rate, i, 0), residuals
 
     buffers = jnp.zeros((rule.dense_stages, *cotangent.shape), cotangent.dtype)
     _, shapes = jax.eval_shape(linearised, 0, buffers)
-    kept = [jnp.zeros((rule.dense_stages, *x.shape), x.dtype) for x in shapes]
-    _, kept = jax.lax.fori_loop(0, top, stage, (buffers, kept))
+    residuals = [jnp.zeros((rule.dense_stages, *x.shape), x.dtype) for x in shapes]
+    _, residuals = jax.lax.fori_loop(0, top, stage, (buffers, residuals))
 
     def sample(carry):
         place, cotangent, bars = carry
@@ -457,9 +466,9 @@ def _step_back(
             bars + stage_cotangents,
         )
 
-    # Reverse of the rule: `bars` are the cotangents of the stages' rates. The result weighs each by
-    # its row of the table, dense output adds its own, and stage by stage, last first, each passes
-    # on to those that it was computed from.
+    # Reverse mode of the Runge-Kutta method: `bars` are the cotangents of the rates of the stages.
+    # The result of the step contributes its weights, samples those of dense output, and each stage,
+    # from the last to the first, contributes to the stages from which it was computed.
     bars = h[None, None] * cotangent[None] * table[0][rule.stages - 1][:, None, None]
     initial_cotangent = jnp.where(finished[None], cotangent, 0)
     place, cotangent, bars = jax.lax.while_loop(
@@ -472,7 +481,7 @@ def _step_back(
         bars, cotangent, sums = carry
         i = top - 1 - j
         bar = jax.lax.dynamic_index_in_dim(bars, i, 0, False)
-        pull = rebuild[-1]([jax.lax.dynamic_index_in_dim(rows, i, 0, False) for rows in kept])
+        pull = rebuild[-1]([jax.lax.dynamic_index_in_dim(rows, i, 0, False) for rows in residuals])
         parameter_cotangents, change = pull(bar)
         bars = bars + (h[None] * change)[None] * table[0][i][:, None, None]
         return bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)]
@@ -482,24 +491,24 @@ def _step_back(
 
 
 def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]:
-    """The arrays that a linear map of ``jax.vjp`` holds, without those ``known``, and a function
-    that builds the map from them. Arrays of one shape are stacked: of a field of formulas there
-    are a hundred, each a number of every body."""
+    """The arrays in a linear map of ``jax.vjp`` (its residuals) without those in ``known``, and a
+    function that builds the map from them. Arrays of one shape are stacked: a field written in
+    components has about a hundred of them, each with one number for every body."""
     leaves, structure = jax.tree.flatten(linear_map)
     numbers = {id(x): k for k, x in enumerate(known)}
-    held = [x for x in leaves if id(x) not in numbers]
-    kinds = list(dict.fromkeys((x.shape, x.dtype) for x in held))
-    groups = [[x for x in held if (x.shape, x.dtype) == kind] for kind in kinds]
+    residuals = [x for x in leaves if id(x) not in numbers]
+    kinds = list(dict.fromkeys((x.shape, x.dtype) for x in residuals))
+    groups = [[x for x in residuals if (x.shape, x.dtype) == kind] for kind in kinds]
 
     def rebuild(stacks):
         rows = [iter([stack[i] for i in range(stack.shape[0])]) for stack in stacks]
-        found = [
+        arrays = [
             known[numbers[id(x)]]
             if id(x) in numbers
             else next(rows[kinds.index((x.shape, x.dtype))])
             for x in leaves
         ]
-        return jax.tree.unflatten(structure, found)
+        return jax.tree.unflatten(structure, arrays)
 
     return [jnp.stack(group) for group in groups], rebuild
 
@@ -507,15 +516,15 @@ def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]
 def _jump_back(
     rates_of, values, motion, note: Note, after: Note, later, t, length, cotangent, live, is_snap
 ):
-    """Contribution of the time of a switch that turned, to the cotangents of the state and of
-    ``values`` (the saltation term), and whether the turn corrected levels that moved with the one
-    before, whose time is theirs too."""
+    """Contribution of the time of a switch to the cotangents of the state and of ``values`` (the
+    saltation term). Also whether the iteration corrected levels that depend on the switch before,
+    whose contribution includes theirs."""
     flips = note.levels != after.levels
     flips = jnp.where(jnp.any(flips, axis=0), flips, after.levels != later)
     # events do not change the rates
     field = jnp.arange(motion.switches) < motion.switches - motion.events
     flips = flips & field[:, None]
-    # past the switch the field of the side before it may be undefined
+    # beyond the switch the field with the previous levels may be undefined
     y_before = jnp.where(is_snap[None], note.y, after.y)
     rates_before, *_ = rates_of(values, note.levels, t, y_before)
     margins, slopes = jax.jvp(
@@ -528,8 +537,8 @@ def _jump_back(
     flips = flips & (live & ~is_correction)[None]
     share = jnp.where(flips, 1, 0).astype(cotangent.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
-    # Of switches that turn together each has the same share of the time: their margins vanish at
-    # once only where they are the same comparison in several places, or by symmetry.
+    # Switches that turn together contribute equal shares: their margins vanish at the same time
+    # only if the same comparison occurs several times, or by symmetry.
     rates_after, *_ = rates_of(values, later, t, after.y)
 
     def margin(parameters, t, y):
@@ -538,8 +547,8 @@ def _jump_back(
         )
 
     rate = jnp.sum(jnp.where(flips, share * slopes, 0), axis=0)
-    # A margin that stands still at its root has no time that could be differentiated (grazing);
-    # the derivative is then that of a motion whose switch turns at a fixed time.
+    # If the margin has zero time derivative at its root (grazing), the time of the switch has no
+    # derivative; it is treated as fixed.
     crosses_surface = jnp.any(flips, axis=0) & (rate != 0)
     weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0) / jnp.where(
         crosses_surface, rate, 1

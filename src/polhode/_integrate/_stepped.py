@@ -1,8 +1,8 @@
-"""The base of the methods that integrate: step control, adjoint, and one call of diffrax.
+"""The base class of the integration methods: choice of the steps, chunks of bodies, adjoint.
 
 ``AbstractIntegration.run`` has two paths: the loop of explicit steps (``_run_by_loop``: few bodies
 with torques, switches, events), and ``diffrax.diffeqsolve`` (``_solve``: the extrapolated midpoint
-rule for batches, and any solver that the user gives).
+rule for batches, and any solver passed by the user).
 """
 
 import inspect
@@ -43,13 +43,13 @@ from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts,
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
 
-# Without its own ``jit``, which would duplicate an array that several parts of the scene share; the
-# call is part of a compiled program anyway.
+# Without the ``jit`` of diffrax, for which an array that several parts of the scene share would be
+# several operands. The call is part of a compiled program anyway.
 _diffeqsolve = inspect.unwrap(diffrax.diffeqsolve)
 
 
 class AbstractIntegration(AbstractMethod):
-    """Base of the methods that integrate with a diffrax solver; see ``LiePoisson``."""
+    """Base of the integration methods; arguments as of ``LiePoisson``."""
 
     chart: AbstractChart
     solver: diffrax.AbstractSolver
@@ -118,19 +118,19 @@ class AbstractIntegration(AbstractMethod):
                 f" {', '.join(hidden_operations)}, in which kinks cannot be located"
             )
         if few or switches:
-            ending = f", each ending where one of {switches} switches (clip, where, ...) turns"
+            ending = f", each ending where one of {switches} switches (clip, where, ...) changes"
             order = 5 if self._automatic.rule(switches) is TSIT5 else 8
             return f"explicit Runge-Kutta steps of order {order}" + (ending if switches else "")
-        carried = ", its rounding carried along" if self._automatic.compensated else ""
+        carried = ", with compensated summation" if self._automatic.compensated else ""
         return f"extrapolated midpoint rule{carried}"
 
     @property
     def keeps_rtol(self) -> bool:
-        """Whether the steps follow from ``rtol``."""
+        """Whether ``rtol`` determines the steps: without a controller passed by the user."""
         return self.controller is None
 
     def _bodies_at_once(self, scene: Scene, state: State, ts: Array, record: Record) -> int:
-        """Default chunk of a solver in which each body has its own steps."""
+        """Default chunk size of a solver that takes individual steps for each body."""
         if not _policy.is_cpu():
             return _policy.ACCELERATOR_BODIES
         solver = self.solver
@@ -173,20 +173,22 @@ class AbstractIntegration(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= min(size, _policy.SORTED_BODIES):
-            # Of other adjoints JAX differentiates the loop itself, and would run it twice.
+            # With other adjoints JAX differentiates the loop itself, and ``linearised`` would make
+            # it run twice.
             linearised = isinstance(self.adjoint, FlowAdjoint)
             unit = kernel(solve_chunk, linearised=linearised, of_units=True)
             solve_all = unit if n <= _policy.KERNEL_BODIES else solve_chunk
             return guarded(solve_all(Distinct((lanes, times))), hidden)
-        # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
+        # chunks of bodies with similar rates, those with most steps first, so that in a work queue
+        # the last bodies to start need few
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
         results = map_chunks(solve_chunk, sorted_lanes, n, size)
         return guarded(jax.tree.map(lambda x: x[jnp.argsort(order)], results), hidden)
 
     def _initial_state(self, scene, state, ts, record: Record):
-        """The initial state, with the work where it is recorded, and whether the coordinates hold
-        it."""
+        """The initial state, with zero work if it is recorded, and whether the coordinates are
+        regular there."""
         y0, sound = self.chart.start(scene, state, ts[..., 0])
         if record.work:
             wheels = scene.dynamics.wheels
@@ -211,8 +213,8 @@ class AbstractIntegration(AbstractMethod):
         record: Record,
         search: Search | None = None,
     ) -> Any:
-        """Samples and events by the loop of explicit steps; None where switches may be hidden from
-        it."""
+        """Samples and events by the loop of explicit steps; None if the field contains operations
+        whose switches cannot be located."""
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def solve_chunk(chunk):
@@ -226,16 +228,16 @@ class AbstractIntegration(AbstractMethod):
             unit = kernel(solve_chunk, linearised=True, of_units=True)
             return map_chunks(unit, Distinct((lanes, times)), n, n)
         size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
-        # bodies of a chunk wait for one another: similar rates in each
+        # bodies of a chunk wait for each other: chunks of bodies with similar rates
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
         results = map_chunks(solve_chunk, sorted_lanes, n, size)
         return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
-        """Bodies that the loop integrates side by side: as many as a fused kernel holds (of 50
-        satellites 64 at once take 3 times as long); where the field does not fit into one, as a
-        network with its matrix products, as many as pay for the calls."""
+        """Bodies that the loop integrates at the same time: as many as in one fused kernel (chunks
+        of 64 take 3 times as long for 50 satellites). If a kernel cannot contain the field, such as
+        a network with matrix products, more, to amortise the calls."""
         problem = self._problem(scene, state, ts, record, search)
         fits = is_holdable(problem.closed_jaxpr.jaxpr)
         return _policy.bodies_at_once(_policy.KERNEL_BODIES if fits else _policy.LANES)
@@ -243,8 +245,8 @@ class AbstractIntegration(AbstractMethod):
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
     ) -> tuple[Samples, Found] | None:
-        """Samples at ``ts`` followed by those at the events, and the events; None where this method
-        does not search for events while it integrates."""
+        """Samples at ``ts`` followed by those at the events, and the events; None if this method
+        does not search for events during the integration."""
         if not self._is_automatic or not state.wxyz.shape[0]:
             return None
         if not self._automatic.located:
@@ -262,16 +264,15 @@ class AbstractIntegration(AbstractMethod):
         return self.solver
 
     def _are_few(self, scene: Scene, state: State) -> bool:
-        """Whether torques act on few bodies and rounding errors need not be carried along, which
-        the explicit steps do not do: in single precision their errors are up to 16 times as large.
-        """
+        """Whether torques act on few bodies and compensated summation is not needed. Explicit steps
+        do not have it: in single precision their errors are up to 16 times as large."""
         few = 0 < state.wxyz.shape[0] <= _policy.EXPLICIT_BODIES
         is_uncompensated = isinstance(self.solver, Automatic) and not self.solver.compensated
         return _torques_act(scene) and few and is_uncompensated
 
     def _suits_loop(self, scene, state, ts, record: Record, jumps: bool) -> tuple[bool, bool]:
-        """Whether the loop of explicit steps is faster, or the only one that ends at switches; and
-        whether other steps must be searched for jumps."""
+        """Whether the loop of explicit steps is used, because it is faster or because its steps end
+        at switches; and whether steps of the midpoint rule must be searched for jumps."""
         if self._are_few(scene, state):
             return True, jumps
         if not self._automatic.located:
@@ -338,8 +339,8 @@ class AbstractIntegration(AbstractMethod):
         states, events = loop_result.states, None
         if search is not None:
             events, times, states = with_events(search, loop_result, times, states)
-        # backward along the exact equations errors of a damped motion grow; along its steps they
-        # do not
+        # If the exact equations of a damped motion are integrated backwards, errors grow. They do
+        # not if the recorded steps are differentiated.
         recorded = problem.switches.count or not self._automatic.located
         if recorded or times.ndim > 1 or _torques_act(scene):
             operands = problem.arrays, unit_data, y, start, times, states, loop_result
@@ -389,7 +390,7 @@ class AbstractIntegration(AbstractMethod):
         rows, follows_flow = None, isinstance(self.adjoint, FlowAdjoint)
         if follows_flow and _torques_act(scene) and ts.shape[0] <= WAY_BACK:
             closed_over = ()
-            if may_jump(scene):  # a function of the user's may close over what is differentiated
+            if may_jump(scene):  # a user's function may close over differentiated arrays
                 program = jax.make_jaxpr(partial(term.vf, args=dynamics))(ts[0], y0)
                 closed_over = program.consts
             ts, rows = with_restarts(ts, record.final_only, (scene, y0, closed_over))
@@ -470,7 +471,7 @@ def _by_units(units, y, rates):
 
 
 def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
-    """Values of the wheels that turn freely or by a motor, as (..., m) of all; else zero."""
+    """Values of the wheels that are not held, as (..., m) for all wheels; zero for the others."""
     values = iter(loose)
     zero = jnp.zeros_like(loose[0])
     return jnp.stack([zero if is_held else next(values) for is_held in wheels.is_held], axis=-1)
@@ -514,12 +515,13 @@ _OF_MIDPOINT = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.
 
 
 def _torques_act(scene: Scene) -> bool:
-    """Whether torques act on the body, those of wheels and motors included: it may be damped."""
+    """Whether torques act on the body, including those of coupled wheels: it may be damped."""
     return scene.torque is not None or bool(scene.dynamics.coupled)
 
 
 def may_jump(scene: Scene) -> bool:
-    """Whether a function of the user's or a part that is not smooth acts on the body."""
+    """Whether the field may have switches: it contains a user's function or a part that is not
+    smooth."""
 
     def is_sharp(x) -> bool:
         return not x.smooth if isinstance(x, AbstractPart) else callable(x)

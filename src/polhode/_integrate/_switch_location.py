@@ -1,4 +1,4 @@
-"""Where within a step the first switch of the field turns, or the first event lies."""
+"""Location of the first switch of the field, or of the first event, within a step."""
 
 from functools import partial
 from typing import NamedTuple
@@ -19,28 +19,30 @@ from polhode._integrate._tableau import Tableau
 from polhode._kernels import any_of
 
 LOCATED_JUMP, LOCATED_KINK, LOCATED_ROOT = 1e-4, 1.0, 0.1
-"""Width of the bracket of a switch of the field, relative to the step: times ``rtol`` at a jump,
-and at a kink, there at most ``LOCATED_ROOT`` times its square root. A step beyond a jump adds an
-error of the change of the rates times this width, one beyond a kink of its square: both are far
-below the error of a step. Derivatives through a kink are off by the width itself, so that the root
-alone, which is enough from 1e-2 on, would leave errors of 100 ``rtol`` at 1e-10. With ten times
-``rtol`` gradients through networks of relu take as long, and with a tenth of it a tenth more time;
-their errors are the same."""
+"""Widths of the bracket within which a switch is located, relative to the step: ``LOCATED_JUMP *
+rtol`` at a jump, and ``min(LOCATED_KINK * rtol, LOCATED_ROOT * sqrt(rtol))`` at a kink.
+
+The error of a step that ends beyond a jump is the change of the rates times this width; beyond a
+kink it is proportional to the square of the width. Both are far below the tolerance of a step.
+Derivatives through a kink, however, have an error of the width itself. The square root alone, which
+is sufficient for ``rtol`` of 1e-2 or larger, would leave errors of 100 ``rtol`` at 1e-10. For
+gradients through networks of relu, 10 ``rtol`` takes as long as ``rtol`` and 0.1 ``rtol`` a tenth
+more time; their errors are the same."""
 
 _TRIES = 2
-"""Evaluations below the root after which the upper end of the bracket is checked."""
+"""Evaluations with positive margins after which the upper end of the bracket is checked."""
 
 _EVALUATIONS = 80
-"""Most evaluations of the margins in the search for one switch."""
+"""Maximum number of evaluations of the margins in the search for one switch."""
 
 _SECANTS = 24
-"""Evaluations in the search from which brackets are halved: 56 times, to rounding."""
+"""Number of evaluations after which brackets are bisected: 56 more reduce them to rounding."""
 
 
 class SwitchPoint(NamedTuple):
-    """First switch within a step: ``hit`` (B,), the fraction ``part`` of the step, ``levels``
-    (K, B) to which the switches ``flips`` (K, B) turn there; fractions up to ``start_fraction``
-    (B,) count as the start itself."""
+    """First switch within a step: ``hit`` (B,), whether there is one; ``part`` (B,), its fraction
+    of the step; ``flips`` (K, B), the switches that turn there; ``levels`` (K, B), their new
+    levels. Fractions up to ``start_fraction`` (B,) count as the start of the step."""
 
     hit: Array
     part: Array
@@ -52,17 +54,18 @@ class SwitchPoint(NamedTuple):
 def first_switch(
     motion, options, progress: Progress, attempt: Attempt, t, accepted, eps
 ) -> SwitchPoint:
-    """The first place within each step at which a margin falls below zero.
+    """The first point within each step at which a margin falls below zero.
 
-    Margins are known at a few stages. The first stage with a negative one gives a bracket; a
-    minimum of the parabola through three neighbours that comes near zero is searched before it,
-    because a margin may dip below zero and return between two stages. Brackets are closed by the
-    Illinois rule (secant, with the retained end halved), every switch with a secant of its own and
-    the earliest root taken. The search aims half the tolerance beyond the root, and ends where the
-    secant says that the upper end is within the tolerance of it: 3 evaluations for a typical
-    switch; 5 if the upper end is checked first, and both ends must come that near."""
-    # The search has no derivatives: a loop whose body closed over tangents would carry them through
-    # every iteration. `_differentiable_part` gives the place its derivatives afterwards.
+    Margins are available at a few stages. The first stage with a negative margin gives a bracket.
+    A margin may fall below zero and return between two stages; therefore, if the parabola through
+    three neighbouring margins has a minimum close to zero, this minimum is examined first. Brackets
+    are closed by the Illinois method (secants, with the value at the retained end halved); each
+    switch has a secant of its own, and the earliest root is used. The search aims half the
+    tolerance beyond the root, and ends when by the secant the upper end is within the tolerance of
+    the root. This takes 3 evaluations for a typical switch. It would take 5 if the upper end were
+    checked first and both ends had to be that close."""
+    # The search is not differentiated: a loop over traced tangents would carry them through every
+    # iteration. `_differentiable_part` adds the derivatives of the root afterwards.
     traced_constants = motion.coefficients, progress, attempt, t
     stopped_constants = jax.lax.stop_gradient(traced_constants)
     _, progress, attempt, t = stopped_constants
@@ -75,7 +78,7 @@ def first_switch(
     first_below = jnp.min(jnp.where(below, order, size), axis=0)
 
     def entry(storage, k):
-        """Entry ``k`` (B,) along the first axis, as a sum, which a fused kernel can hold."""
+        """Entry ``k`` (B,) along the first axis, as a sum, which a fused kernel can contain."""
         pick = order == k[None]
         pick = pick.reshape(size, *[1] * (storage.ndim - 2), -1)
         return jnp.sum(jnp.where(pick, storage, 0), axis=0)
@@ -86,7 +89,7 @@ def first_switch(
         entry(sampled, first_below - 1),
         entry(sampled, jnp.minimum(first_below, size - 1)),
     )
-    # of the minima the one that comes nearest to zero, before any negative margin
+    # the minimum closest to zero among those before the first negative margin
     depth = attempt.depths
     inner_order = jnp.arange(1, size - 1)[:, None, None]
     depth = jnp.where(inner_order < first_below[None, None], depth, 1)
@@ -104,21 +107,22 @@ def first_switch(
     values = tuple(lowest(margins) for margins in around)
     start_margins = jnp.maximum(
         around[0], 0
-    )  # enough for the first secant, though the low end moves
+    )  # sufficient for the first secant, although the lower end moves
     busy = accepted & jnp.any(below, axis=0)
-    # a margin after the end is that of the state itself, those between are of stages
+    # A negative margin at the last node is that of the state at the end of the step, and is
+    # certain. Those at other nodes belong to stages, which are less accurate than dense output.
     is_at_end = busy & (first_below == size - 1)
     bracket = jnp.where(is_at_end, ROOT, jnp.where(busy, FIRST, DONE))
     mode = jnp.where(dips, MINIMUM, bracket)
     end = sampled[-1]
     zero = jnp.zeros_like(attempt.h)
-    # Far from zero, margins of the time are constant between representable times (``grain`` eps of
-    # the step). The search ends on the far side of the root: switches located to no more than that
-    # would all turn late, and the jumps of a torque do work on the body.
+    # At large times, margins that depend on the time are constant between representable times,
+    # which are ``grain`` eps of the step apart. The search ends beyond the root, so that switches
+    # located to one such interval would all turn late, and jumps of a torque would do false work.
     moment = jnp.maximum(progress.elapsed, jnp.abs(t))
     grain = moment / jnp.where(zero != attempt.h, abs(attempt.h), 1)
     tolerance = 4 * eps * jnp.maximum(1, grain / 16)
-    if not motion.events:  # an event is located to rounding, a change of the rates is not
+    if not motion.events:  # events are located to rounding, switches of the rates to ``rtol``
         rtol = options.rtol.astype(tolerance.dtype)
         kink = jnp.minimum(LOCATED_KINK * rtol, LOCATED_ROOT * jnp.sqrt(rtol))
         located = LOCATED_JUMP * rtol if motion.jumps else kink
@@ -138,10 +142,10 @@ def first_switch(
 
     def secant(search):
         gap, room = search.high - search.low, tolerance / 2
-        # margins that are zero over a part of the bracket defeat secants, not bisection
+        # secants do not converge if margins are zero in a part of the bracket; bisection does
         halve = (search.count % 8 == 7) | (search.count >= _SECANTS)
         share = jnp.where(halve, 0.5, root_share(search.at_low, search.at_high))
-        # nearer to an end than half the tolerance it could not move that end
+        # points closer than half the tolerance to an end would hardly shorten the bracket
         x = jnp.maximum(search.low + gap * share, search.low) + room
         return jnp.minimum(x, search.high - room)
 
@@ -170,9 +174,9 @@ def first_switch(
         _, bottom = vertex_of((ta, tb, tc), (va, vb, vc))
         over = (bottom > 0.7 * vb) | (search.count > 12)
         dipped = in_minimum & under
-        flat = in_minimum & ~under & over  # no switch here: go on to the bracket of a later stage
+        flat = in_minimum & ~under & over  # no root here: continue with the bracket of a stage
 
-        # a negative margin of a stage may be positive on dense output
+        # a margin that is negative at a stage may be positive on dense output
         is_false = in_upper_end & ~under
         has_later_root = is_false & jnp.any(end < 0, axis=0) & (search.high < 1)
         retry_mode = jnp.where(search.count < _TRIES, FIRST, UPPER_END)
@@ -247,17 +251,19 @@ def first_switch(
 
 
 def is_unresolved(motion, margins: Array, rule: Tableau) -> Array:
-    """Whether a margin of a jump, of an event or of the time turns back more than once within the
-    step (B,), or once by most of its size: its next turn may then lie between two stages.
+    """Whether (B,) a margin of a jump, of an event or of the time has more than one turning point
+    within the step, or one by most of its size: a further one may then lie between two stages.
 
-    The field with its levels held may hardly change where they do: a body that the Sun lights turns
-    so slowly that one step could lead from sunlight to sunlight, several shadows between. Margins
-    of kinks that move with the state are not looked at: they are as smooth as the state, networks
-    have many, and where one is rounding alone steps would become short for nothing."""
+    The error control does not see this, because the field with fixed levels may hardly change: a
+    body in sunlight may rotate so slowly that one step leads from sunlight to sunlight, with
+    several shadows in between. Margins of kinks that vary with the state are not examined: they are
+    as smooth as the state, networks have many of them, and one that is rounding alone would shorten
+    the steps for no reason."""
     sampled = jnp.stack([margin_samples(margins, rule)[:, k] for k in motion.swift], axis=1)
     size = jnp.max(jnp.abs(sampled), axis=0)
     least, deep = control.MARGIN_TURN * size, control.DEEP_TURN * size
-    # extremes since the last turn: smaller turns than the least are rounding, or errors of stages
+    # ``low`` and ``high``: extremes since the last turning point. Changes smaller than ``least``
+    # are rounding or errors of the stages.
     low = high = sampled[0]
     rises = falls = turns = jnp.zeros_like(low)
     for margin in sampled[1:]:
@@ -275,9 +281,11 @@ def is_unresolved(motion, margins: Array, rule: Tableau) -> Array:
 
 
 def first_of_jumps(motion, flips: Array) -> Array:
-    """Of switches (K, B) that would turn together, among which the rates jump at some, the first of
-    these, and events. The other ones may depend on it, as comparisons do in a search in a table:
-    whether they turn too is seen at the start of the next step."""
+    """``flips`` (K, B) without those switches that may depend on another one that turns.
+
+    If the rates jump at several switches that would turn together, only the first of these, and
+    events, turn. The others may depend on the first one, as comparisons in a search in a table do;
+    whether they turn as well is decided at the start of the next step."""
     if not motion.jumps:
         return flips
     order = jnp.arange(motion.switches)[:, None]
@@ -288,15 +296,15 @@ def first_of_jumps(motion, flips: Array) -> Array:
 
 
 DONE, ROOT, UPPER_END, MINIMUM, FIRST = range(5)
-"""What the search in a step does next: nothing; close the bracket between ``low`` and ``high``, of
-which ``high`` has a negative margin; see whether it has; go down to a minimum; or try the root
-before ``high`` has been seen."""
+"""Next action of the search in a step. DONE: nothing. ROOT: close the bracket between ``low`` and
+``high``, whose margin at ``high`` is negative. UPPER_END: check whether it is. MINIMUM: approach a
+minimum. FIRST: evaluate the secant's root before ``high`` has been checked."""
 
 
 class _RootSearch(NamedTuple):
-    """Carry of the search: see ``DONE``. ``at_low``, ``at_high`` (K, B): margins at the ends of the
-    bracket; ``side`` (B,): the end that moved last; ``triple``, ``values``: places around a minimum
-    and the least margin there; ``count`` of evaluations."""
+    """Carry of the search. ``mode``: see ``DONE``; ``at_low``, ``at_high`` (K, B): margins at the
+    ends of the bracket; ``side`` (B,): which end moved last; ``triple``, ``values``: three points
+    around a minimum and the lowest margin at each; ``count`` of evaluations."""
 
     mode: Array
     low: Array
@@ -312,8 +320,8 @@ class _RootSearch(NamedTuple):
 
 
 def _differentiable_part(hit: Array, flips: Array, part: Array, margins_at) -> Array:
-    """The place of a switch with first and second derivatives: two steps of Newton's rule with one
-    derivative for both."""
+    """The fraction at which a switch turns, with first and second derivatives: two steps of
+    Newton's method with the same derivative of the margin."""
     stop_gradient = jax.lax.stop_gradient
     share = jnp.where(flips, 1, 0).astype(part.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
@@ -335,9 +343,9 @@ def pick(where: Array, a: Array, b: Array) -> Array:
 
 
 class Undefined(NamedTuple):
-    """Steps during which the field is undefined on the side that is assumed, as that of ``where(x >
-    0, sqrt(x), 0)`` with ``x > 0`` held: ``is_undefined`` (B,); ``flips`` (K, B): switches that
-    were passed; ``snaps`` (B,): whether the start is so near that they turn there."""
+    """Steps in which the field with fixed levels becomes undefined, as ``where(x > 0, sqrt(x), 0)``
+    does with ``x > 0`` fixed: ``is_undefined`` (B,); ``flips`` (K, B): the switches crossed;
+    ``snaps`` (B,): whether the start is so close to them that they turn there."""
 
     is_undefined: Array
     flips: Array
@@ -347,7 +355,7 @@ class Undefined(NamedTuple):
 def undefined_side(
     attempt: Attempt, ratio: Array, is_running: Array, rule: Tableau
 ) -> tuple[Undefined, Array]:
-    """Such steps, and the fraction of each up to the first switch."""
+    """Steps in which the field becomes undefined, and the fraction of each up to the switch."""
     margins, nodes = attempt.margins[: rule.stages], rule.nodes[: rule.stages]
     below = margins < 0
     order = jnp.arange(rule.stages)[:, None]

@@ -1,10 +1,10 @@
-"""Where a field kinks or jumps, read from the field's own program.
+"""Switches of a field: the operations of its jaxpr at which it may have a kink or a jump.
 
-``max``, ``clip``, ``where``, comparisons, ``floor``, ... of values that move with the state or the
-time are the *switches* of a field. Each has a *level* (which side of a comparison, which integer of
-a ``floor``), and with all levels held the field is smooth. The *margin* of a switch is positive as
-long as its level is the right one, and falls through zero where the switch turns, so the levels of
-a step can be held and the step ended where the first margin vanishes.
+``max``, ``clip``, ``where``, comparisons, ``floor``, ... of values that vary with the state or the
+time are the *switches* of a field. Each has a *level*: the side of a comparison, or the integer of
+a ``floor``. With all levels fixed the field is smooth. The *margin* of a switch is positive as long
+as its level is correct, and falls through zero where the switch turns. A step is therefore
+integrated with fixed levels, and ends where the first margin vanishes.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,34 +30,36 @@ _OTHERS = frozenset(
 )
 _SORTS = frozenset(("sort", "top_k", "cummax", "cummin"))
 _NOT_DIFFERENTIABLE = frozenset(("while", "pure_callback", "io_callback", "ffi_call"))
-"""Operations without a derivative of their own, that of a forward loop aside."""
+"""Operations whose derivatives JAX refuses, in reverse mode at least (``while``)."""
 _OPAQUE = _NOT_DIFFERENTIABLE | frozenset(
     "bitcast_convert_type nextafter approx_top_k reduce reduce_window reduce_window_max"  # noqa: SIM905
     " reduce_window_min select_and_gather_add scatter-max scatter-min".split()
 )
-"""Operations whose switches are not found: ``Switched.hidden_operations`` names them."""
+"""Operations whose switches cannot be located: ``Switched.hidden_operations`` lists them."""
 
 _CONSTANT = frozenset(("eq", "ne", "is_finite"))
-"""Comparisons that turn at single points of a motion, or in one that has failed."""
+"""Comparisons that change at isolated points of a motion only, or in one that has failed: they are
+not switches."""
 
 _PIVOTED = frozenset(("lu",))
-"""Operations with integers among their results, of which what is solved with them is smooth."""
+"""Operations that return integers (pivots), although solutions computed with them are smooth."""
 
 _COMPOSED = "call_hi_primitive"
-"""Operations that are programs of others, as ``jnp.searchsorted`` from JAX 0.12 on."""
+"""Operations that expand to other operations, as ``jnp.searchsorted`` from JAX 0.12 on."""
 
 _SORTED = 16
-"""Most numbers that are sorted by comparisons of pairs."""
+"""Largest number of values that are sorted by pairwise comparisons."""
 
 
 class Switched(NamedTuple):
-    """A program with its switches apart.
+    """A program and its K switches.
 
-    ``frozen(levels, *args)``: results with the levels (K,) held, the margins (K,), and the level
-    that each switch turns to where its margin falls below zero; ``levels(*args)``: those at a
-    point, in the dtype of the state; ``jumps`` (K,): whether the results may jump there (else they
-    kink); ``timed`` (K,): whether the margin moves with the time alone; ``hidden_operations``:
-    those inside which there may be switches that were not found.
+    - ``frozen(levels, *args)``: the results with fixed levels (K,), the margins (K,), and the level
+      to which each switch changes when its margin falls below zero;
+    - ``levels(*args)``: the levels at a point, in the dtype of the state;
+    - ``jumps`` (K,): whether the results may jump at the switch (otherwise they have a kink);
+    - ``timed`` (K,): whether the margin varies with the time alone;
+    - ``hidden_operations``: operations that may contain switches that cannot be located.
     """
 
     frozen: Callable[..., tuple[list[Any], Array, Array]]
@@ -73,12 +75,11 @@ class Switched(NamedTuple):
 
 
 STATE, TIME = 1, 2
-"""What a value moves with; 3 with both, 0 with neither."""
+"""What a value varies with: the state, the time, both (3) or neither (0)."""
 
 
 def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Switched:
-    """The switches of a program; ``varies``: what each of its arguments moves with, ``STATE``,
-    ``TIME`` or 0."""
+    """The switches of a program; ``varies``: for each of its arguments ``STATE``, ``TIME`` or 0."""
 
     def run(args, chooser):
         walk = _Walk(chooser)
@@ -120,8 +121,8 @@ def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Sw
 
 
 def guarded(results: Any, hidden: tuple[str, ...]) -> Any:
-    """``results``, whose derivatives raise where they would leave out jumps inside the operations
-    ``hidden`` and these do not raise by themselves."""
+    """``results``, whose derivatives raise NotImplementedError if they would omit jumps inside the
+    ``hidden`` operations. Operations that JAX itself refuses to differentiate are not named."""
     named = ", ".join(name for name in hidden if name not in _NOT_DIFFERENTIABLE)
     if not named:
         return results
@@ -134,8 +135,8 @@ def guarded(results: Any, hidden: tuple[str, ...]) -> Any:
 
 
 class _Rule(NamedTuple):
-    """``level(u)`` of a switching function; ``margin(u, level)``; ``new_level(u,
-    level)``: the level after the switch turns."""
+    """Functions of the argument u of a switch: its ``level(u)``, its ``margin(u, level)``, and
+    ``new_level(u, level)``, the level after it turns."""
 
     level: Callable[[Any], Any]
     margin: Callable[[Any, Any], Any]
@@ -163,21 +164,20 @@ _TRUNC = _Rule(
 )
 
 
-# The program is walked through twice with the same order of choices: once with levels given
-# (`_Held`), once deciding them (`_Free`). A level is known by its place in that order alone, so the
-# walk must not depend on values; loops are unrolled and all branches of a `cond` evaluated for
-# that reason.
+# The jaxpr is interpreted with fixed levels (`_Held`), or to compute the levels (`_Free`). A level
+# is identified only by the order in which the interpreter reaches its switch, so this order must
+# not depend on values: loops are unrolled, and all branches of a `cond` are evaluated.
 
 
 class _Held:
-    """Gives the levels one after another, and collects margins."""
+    """Returns fixed levels one after another, and collects the margins."""
 
     def __init__(self, levels):
         self.levels, self.place, self.margins, self.new_levels = levels, 0, [], []
 
     def choose(self, u, rule: _Rule, jumps: bool):
-        # The margin keeps the slope of u: it is also what the place of the switch is differentiated
-        # by, and a distance to the switch in any other measure would have to be differentiated too.
+        # The margin has the derivatives of u (up to its sign), because the time of the switch is
+        # differentiated through it; a normalised margin would add derivatives of its scale.
         u = jnp.asarray(u)
         level = self.levels[self.place : self.place + u.size].reshape(u.shape)
         self.place += u.size
@@ -194,7 +194,7 @@ class _Held:
 
 
 class _Free:
-    """Decides every level by its own function, and collects them."""
+    """Computes every level from its argument, and collects the levels."""
 
     def __init__(self, dtype):
         self.dtype, self.levels, self.jumps = dtype, [], []
@@ -211,7 +211,7 @@ class _Free:
 
 
 def _may_switch(jaxpr) -> bool:
-    """Whether a program holds an operation that may be a switch, or hide one."""
+    """Whether a program contains an operation that may be a switch or contain one."""
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name in _CALLS and eqn.params.get("name") == SMOOTH:
@@ -247,11 +247,11 @@ def _is_float(x) -> bool:
 
 
 def _is_step(eqn) -> bool:
-    """Whether an operation that is not known here makes integers of floats: it must jump."""
+    """Whether an operation not listed above converts floats to integers: its result must jump."""
     if not any(v.aval.dtype == bool or _is_integer(v.aval.dtype) for v in eqn.outvars):
         return False
     name = eqn.primitive.name
-    # a conversion to integers is known, and one to bool is as ``ne``
+    # conversions to integers are handled in ``_switch``, and one to bool is equivalent to ``ne``
     if name == "convert_element_type" or name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED:
         return False
     return any(map(_is_float, eqn.invars)) and not any(True for _ in _subjaxprs(eqn))
@@ -266,11 +266,12 @@ def _is_integer(dtype) -> bool:
 
 
 class _Walk:
-    """Goes through a program once; values are pairs (array, what it moves with)."""
+    """An interpreter of jaxprs; values are pairs of an array and what it varies with."""
 
     def __init__(self, chooser):
         self.chooser, self.hidden_operations = chooser, []
-        self.moves, self.timed = 0, []  # of the operation at hand; of each switch
+        # ``moves``: what the current operation varies with; ``timed``: for each switch
+        self.moves, self.timed = 0, []
 
     def jaxpr(self, jaxpr, consts, args):
         env: dict[Any, Any] = {v: (c, 0) for v, c in zip(jaxpr.constvars, consts)}
@@ -284,7 +285,7 @@ class _Walk:
         return [read(v) for v in jaxpr.outvars]
 
     def side(self, u, jumps: bool = False, rule: _Rule = _SIDE):
-        """Whether ``u`` is not below zero, held within a step."""
+        """A switch: whether ``u`` is not negative, constant within a step."""
         return self.choose(u, rule, jumps) > 0
 
     def choose(self, u, rule: _Rule, jumps: bool):
@@ -301,7 +302,7 @@ class _Walk:
         if moves and name == "scan" and any(map(_may_switch, _subjaxprs(eqn))):
             return self._scan(eqn, operands)
         branches = list(_subjaxprs(eqn)) if moves and name == "cond" else []
-        # a check (``eqx.error_if``) runs in its own branch alone
+        # a check (``eqx.error_if``) must be evaluated in its own branch only
         if any(map(_may_switch, branches)) and not any(map(_calls_back, branches)):
             return self._cond(eqn, operands)
         if moves and name == _COMPOSED:
@@ -330,8 +331,9 @@ class _Walk:
             return [(self._select_larger(a, b, name == "max"), True)]
         if name == "abs":
             return [(jnp.where(self.side(x[0]), x[0], -x[0]), True)]
-        # Comparisons give numbers that do not move while their level is held: what follows of them
-        # alone (a table index, a mask) needs no switch of its own.
+        # The second entry: whether the result varies while the levels are fixed. The result of a
+        # comparison does not, so that values computed from it alone (a table index, a mask) have no
+        # switches.
         if name == "sign":
             one = jnp.ones((), out.dtype)
             return [(jnp.where(self.side(x[0], True), one, -one), False)]
@@ -358,7 +360,7 @@ class _Walk:
             return [
                 (self._integer_level(x[0], _TRUNC, eqn.invars[0].aval).astype(out.dtype), False)
             ]
-        # On the negative axis the angle jumps by a turn. With the side of y held it goes on
+        # On the negative x axis the angle jumps by 2 pi. With the sign of y fixed it continues
         # smoothly, and the jump becomes a switch.
         if name == "atan2":
             y, x = x
@@ -373,8 +375,8 @@ class _Walk:
         if name in ("argmax", "argmin"):
             _, place = self._extreme(x[0], eqn.params["axes"], name == "argmax", jumps=True)
             return [(place.astype(out.dtype), False)]
-        # Pairs are compared, n (n - 1) / 2 switches for n numbers. Beyond 16 that would be more
-        # than most fields have, and the operation is opaque.
+        # Pairs are compared: n (n - 1) / 2 switches for n numbers. For more than 16 these would
+        # outnumber all others, and the operation is treated as opaque.
         if name == "sort" and eqn.params["num_keys"] == 1:
             axis = eqn.params["dimension"]
             if x[0].shape[axis] <= _SORTED:
@@ -413,15 +415,14 @@ class _Walk:
         return level.astype(out.dtype)
 
     def _extreme(self, x, axes, larger: bool, jumps: bool = False):
-        """The largest number along ``axes`` and its place, by comparisons of pairs."""
+        """The largest or smallest number along ``axes`` and its index, by pairwise comparisons."""
         axes = [a % x.ndim for a in axes]
         shape = [n for k, n in enumerate(x.shape) if k not in axes]
         rows = jnp.moveaxis(x, axes, range(len(axes))).reshape(-1, *shape)
         places = jnp.arange(rows.shape[0]).reshape(-1, *[1] * len(shape))
         places = jnp.broadcast_to(places, rows.shape)
-        # A tournament of neighbours, of which the first wins where they are equal: as many
-        # comparisons as a chain of them, but in log n turns of this loop, so that the program grows
-        # with log n only.
+        # A tournament of neighbours; the first of two equal ones wins. It has as many comparisons
+        # as a chain, but log n iterations of this loop, so that the program grows with log n only.
         while rows.shape[0] > 1:
             even = rows.shape[0] // 2 * 2
             is_first = self.side(
@@ -434,8 +435,8 @@ class _Walk:
         return rows[0], places[0]
 
     def _sort(self, columns):
-        """Columns (n, ...) by the first one in rising order: the place of a number is how many
-        others come before it."""
+        """Columns (n, ...) sorted by the first one in ascending order: the new index of a number is
+        the number of others that come before it."""
         keys, jumps = columns[0], len(columns) > 1
         place = jnp.zeros(keys.shape, jnp.int32)
         for distance in range(1, len(keys)):
@@ -456,7 +457,7 @@ class _Walk:
         return self.jaxpr(subjaxpr, (), operands)
 
     def _expanded(self, eqn, operands):
-        """The program that an operation stands for."""
+        """Interpret the program to which a composed operation expands."""
         operation = eqn.params["_prim"]
 
         def program(*x):
@@ -466,7 +467,7 @@ class _Walk:
         return self.jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, operands)
 
     def _cond(self, eqn, operands):
-        """All branches, of which the index picks one."""
+        """All branches are evaluated, and the index selects the results of one."""
         (index, moves), branch_operands = operands[0], operands[1:]
         branches = [self.jaxpr(b.jaxpr, b.consts, branch_operands) for b in eqn.params["branches"]]
         index = jnp.clip(jnp.asarray(index, jnp.int32), 0, len(branches) - 1)
@@ -479,7 +480,8 @@ class _Walk:
         return out
 
     def _scan(self, eqn, operands):
-        """The turns of a loop one after another: its switches are those of all turns."""
+        """The loop unrolled: each iteration has switches of its own. Only loops with switches are
+        interpreted here."""
         body, length = eqn.params["jaxpr"], eqn.params["length"]
         if "num_consts" in eqn.params:
             const_count, carry_count = eqn.params["num_consts"], eqn.params["num_carry"]
@@ -490,7 +492,6 @@ class _Walk:
             operands[const_count : const_count + carry_count],
             operands[const_count + carry_count :],
         )
-        # Unrolled, since each turn has switches of its own. Only loops with switches come here.
         order = range(length)[::-1] if eqn.params["reverse"] else range(length)
         stacked: list[Any] = [None] * length
         for k in order:
@@ -511,6 +512,6 @@ def _bind(eqn, x) -> Sequence[Any]:
     bind_params = eqn.primitive.get_bind_params(eqn.params)
     funs, params = (
         bind_params if isinstance(bind_params, tuple) else ((), bind_params)
-    )  # as older versions of JAX
+    )  # older versions of JAX return functions too
     out = eqn.primitive.bind(*funs, *x, **params)
     return out if eqn.primitive.multiple_results else [out]

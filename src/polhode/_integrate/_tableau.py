@@ -1,4 +1,4 @@
-"""Explicit Runge-Kutta rules that the loop of explicit steps can take: DOP853 and Tsit5."""
+"""Coefficients of the explicit Runge-Kutta methods of the integration loop: DOP853 and Tsit5."""
 
 from dataclasses import dataclass, field
 
@@ -7,16 +7,18 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Tableau:
-    """Coefficients of an explicit rule the last stage of which stands at the end of the step.
+    """Coefficients of an explicit Runge-Kutta method whose last stage is at the end of the step.
 
-    ``order`` of the error estimate in the width; ``nodes`` (S,): where all S stages stand in the
-    step; ``weights`` (S, S): of the stages before; ``stages``: how many the step needs, the others
-    belong to dense output; ``errors``: weights of one error estimate, or of two of different
-    order; ``difference``: weights of a divided difference of the rates, or None; ``dense`` (K, S):
-    of the coefficients of dense output beyond the cubic of Hermite; ``dense_error``: error of dense
-    output over that at the end of the step, in the mean of turning bodies; ``margin_stages``: in
-    order of time, those at which switches are inspected;
-    ``stability``: the width times a rate of decay from which on a step amplifies errors."""
+    - ``order``: of the error estimate in the width;
+    - ``nodes`` (S,): of all S stages; ``weights`` (S, S): of the previous stages;
+    - ``stages``: number of stages of a step; the others are those of dense output;
+    - ``errors``: weights of one error estimate, or of two of different orders;
+    - ``difference``: weights of a divided difference of the rates, or None;
+    - ``dense`` (K, S): weights of the coefficients of dense output beyond Hermite's cubic;
+    - ``dense_error``: error of dense output over that at the end of the step, in the mean of
+      rotating bodies;
+    - ``margin_stages``: in order of time, the stages at which margins of switches are examined;
+    - ``stability``: width times rate of decay beyond which a step amplifies errors."""
 
     order: int
     nodes: np.ndarray
@@ -41,10 +43,10 @@ class Tableau:
 
 
 _DOP853_STAGES = 13
-"""Stages of a step, the last of which stands at its end and is the first of the next step."""
+"""Stages of a step, of which the last is at its end and is the first of the next step."""
 
 _DOP853_DENSE_STAGES = 16
-"""Stages with those of dense output."""
+"""Stages including those of dense output."""
 
 _DOP853_NODES = (
     0.0,
@@ -158,7 +160,7 @@ _DOP853_ROWS = {
         14: -9.15095847217987,
     },
 }
-"""Weights of the stages before, for each stage."""
+"""Weights of the previous stages, for each stage."""
 
 _DOP853_DENSE = {
     0: {
@@ -277,7 +279,7 @@ DOP853 = Tableau(
         _filled(_DOP853_ERROR_3, (1, _DOP853_STAGES))[0],
     ),
     # The only combination of the stages that is of the seventh order in the width for every field:
-    # all 37 order conditions up to the sixth hold, and no other solves them.
+    # it alone satisfies all 37 order conditions up to the sixth.
     _divided_difference((0, 5, 6, 7, 8, 9, 10)),
     _filled(_DOP853_DENSE, (4, _DOP853_DENSE_STAGES)),
     10,
@@ -344,7 +346,7 @@ TSIT5 = Tableau(
     None,
     _TSIT5_DENSE,
     3,
-    # the sixth stage stands at the end too, less accurately than the seventh
+    # without the sixth stage, which is at the end of the step and less accurate than the seventh
     (0, 1, 2, 3, 4, 6),
     3.5,
 )

@@ -1,9 +1,10 @@
-"""One turn of the loop of explicit Runge-Kutta steps: try a step, and accept, refuse or cut it.
+"""One iteration (*turn*) of the loop of explicit Runge-Kutta steps: attempt a step, and accept it,
+reject it or end it at a switch.
 
-A step holds the levels of all switches of the field (``_switches.py``), so the field within it is
-smooth. If the margin of a switch falls below zero within the step, the step ends where it does, on
-the polynomial of dense output, and the switch turns. An event is a switch on which the field does
-not depend.
+During a step the levels of all switches of the field (``_switches.py``) are constant, so that the
+field is smooth. If the margin of a switch falls below zero within the step, the step ends at that
+point, on the polynomial of dense output, and the switch turns: it changes its level. An event is a
+switch on which the field does not depend.
 """
 
 from typing import NamedTuple
@@ -43,8 +44,8 @@ class LoopOptions(NamedTuple):
 
     ``rtol``: bound of the sum of the errors of the steps [rad]; ``max_steps``: of each body;
     ``capacity``: events stored for each body; ``directions``: of each event 1, -1 or 0 for both;
-    ``terminal``: whether a body stops at each; ``differentiable``: whether the place of a switch
-    carries derivatives."""
+    ``terminal``: whether a body stops at each; ``differentiable``: whether the times at which
+    switches turn have derivatives."""
 
     rtol: Array
     max_steps: int
@@ -56,8 +57,8 @@ class LoopOptions(NamedTuple):
 
 class Storage(NamedTuple):
     """Output of the loop: ``samples`` (B * (T + 1), D); of events ``times``, ``which`` (B * (E +
-    1), 1) and ``states`` (B * (E + 1), D). The last row of each body is a bin for what is not
-    stored."""
+    1), 1) and ``states`` (B * (E + 1), D). The last row of each body is a dummy row, which is
+    written in iterations in which the body has nothing to store."""
 
     samples: Array
     times: Array
@@ -81,8 +82,8 @@ def advance(
     is_running = progress.outcome == RUNNING
     width, is_last = _width(progress, length, is_running, eps)
     t, h = start + sign * progress.elapsed, sign * width
-    # Three stages more (of order 8), evaluated only where a sample lies within the step or, in
-    # `attempt_step`, a switch comes near: a step without either costs what it does without both.
+    # Dense output takes three additional stages (order 8). They are evaluated only if a sample lies
+    # within the step, or if `attempt_step` finds that a switch may turn in it.
     needs_dense = is_running & (progress.place < ts.shape[0])
     needs_dense = needs_dense & (
         jnp.abs(column(ts, progress.place) - start) <= progress.elapsed + width
@@ -97,10 +98,11 @@ def advance(
     turn = wrong_levels = None
     is_long = jnp.zeros_like(accepted)
     if motion.switches:
-        # At the first step, and where another switch has just turned, a level may be that of the
-        # wrong side already at the start: one comparison moves another one's argument, or rounding
-        # decides. The step is then repeated with the level turned, without moving on. A switch that
-        # has just turned itself stands at its root, where the sign of its margin is rounding.
+        # At the first step, and after another switch has turned, a level may be wrong already at
+        # the start of the step, because the argument of one comparison depends on another one, or
+        # by rounding. The level is then corrected and the step repeated from the same state. A
+        # switch that has just turned is at its root, where the sign of its margin is rounding, and
+        # is not corrected.
         wrong_levels = (
             progress.needs_rates[None]
             & (attempt.margins[0] < 0)
@@ -132,17 +134,20 @@ def advance(
     def conclude(*operands):
         return _conclude(motion, options, eps, *operands)
 
-    # Many short loops over the bodies, and no field in them: a unit also where the whole loop
-    # cannot be one. Gradients through networks take a tenth less time, and a tenth less to compile.
+    # This part consists of many short loops over the bodies and does not contain the field, so that
+    # it can be a unit where the whole loop cannot. Gradients through networks take a tenth less
+    # time to run and to compile.
     conclude = conclude if motion.is_whole else kernel(conclude)
     return conclude(start, ts, progress, storage, trial)
 
 
 class _Trial(NamedTuple):
-    """A step that was tried, of unsigned ``width``, with its ``error`` [rad], the ``ratio`` of that
-    to its tolerance, and its ``angle`` [rad]; ``is_long``: a margin turns back more than once in
-    it; ``wrong_levels`` (K, B): switches on the wrong side at its start; ``turn``: the first switch
-    in it; None where there are no switches."""
+    """An attempted step of unsigned ``width``, its ``error`` [rad], the ``ratio`` of the error to
+    the tolerance, and its ``angle`` [rad].
+
+    ``is_long``: a margin has more turning points than the stages resolve; ``wrong_levels`` (K, B):
+    switches with a wrong level at the start of the step; ``turn``: the first switch that turns in
+    the step. Both are None if the field has no switches."""
 
     attempt: Attempt
     width: Array
@@ -168,7 +173,7 @@ def _conclude(
     storage: Storage,
     trial: _Trial,
 ) -> tuple[Progress, Storage]:
-    """What follows from a step that was tried: the next state, width, levels and outcome."""
+    """State, width of the next step, levels and outcome after an attempted step."""
     stop_gradient = jax.lax.stop_gradient
     attempt, width, is_running, accepted = (
         trial.attempt,
@@ -183,10 +188,10 @@ def _conclude(
 
     elapsed = jnp.where(trial.is_last, length, progress.elapsed + width)
     elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
-    # of a step that a switch cuts the state is that of dense output, which is less accurate
+    # If the step ends at a switch, its final state is one of dense output, which is less accurate.
+    # This larger error only affects the width of the next step: to reject the step until dense
+    # output satisfies the tolerance would take one more attempt for every switch.
     state_ratio = ratio * jnp.where(hit, motion.rule.dense_error, 1)
-    # Only the width is chosen by that larger error. Refusing such a step instead, to shorten it
-    # until dense output keeps the tolerance, would cost an attempt for every switch.
     size = jnp.log(jnp.clip(state_ratio, control.MIN_RATIO, 1e12))
     memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
     factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
@@ -195,9 +200,9 @@ def _conclude(
     proposed = jnp.where(is_cut, jnp.maximum(progress.width, width * factor), width * factor)
     guess = stop_gradient(_first_width(motion, options, progress.y, attempt.stages[0], length))
     proposed = jnp.where(is_first, guess, jnp.where(trial.is_long, width / 2, proposed))
-    # With `x > 0` held, `where(x > 0, sqrt(x), 0)` is NaN beyond the switch, so that there is no
-    # root to search for. The step is shortened towards the switch instead, and turns it when it
-    # cannot come nearer ("snaps").
+    # If the level `x > 0` stays fixed, `where(x > 0, sqrt(x), 0)` is NaN beyond the switch, and the
+    # margin has no root that could be bracketed. The step is shortened towards the switch instead,
+    # until it is within rounding of it; then the switch turns ("snaps").
     undefined = None
     if motion.switches:
         undefined, share = undefined_side(attempt, ratio, is_running & ~is_first, motion.rule)
@@ -208,7 +213,7 @@ def _conclude(
         snaps = undefined.is_undefined & (width * share <= grain)
         undefined = undefined._replace(snaps=snaps)
         reach = jnp.minimum(jnp.maximum(2 * width * share, grain), (length - progress.elapsed) / 2)
-        # as short as the last step towards the switch: derivatives may be unbounded there
+        # As short as the last step before the switch: derivatives may be unbounded there.
         proposed = jnp.where(snaps, reach, proposed)
         reach = _with_slope(reach, width * share, attempt.margins[0], undefined.flips)
     storage, place = _save(
@@ -264,7 +269,7 @@ def _conclude(
 
 
 def snap_reach(elapsed: Array, length: Array, eps: float) -> Array:
-    """How near to a switch, in time, the state is moved past it (see ``_snap``)."""
+    """Distance in time to a switch below which the state is moved past it (see ``_snap``)."""
     return control.GRAIN * eps * jnp.maximum(elapsed, 0.01 * length)
 
 
@@ -276,11 +281,11 @@ def _snap(
     reach: Array,
     sign: Array,
 ) -> Progress:
-    """Turn switches beyond which the field is undefined on the side that was held.
+    """Turn switches beyond which the field with the previous levels is undefined.
 
-    ``reach`` (B,): time from the start of the step to as far beyond the switch, along the ``rate``
-    (D, B); ``sign`` of time. The field of ``sqrt(abs(x))`` is undefined before the switch as soon
-    as that has turned, so the state must have passed it."""
+    The state moves past the switch along the ``rate`` (D, B), by the time ``reach`` (B,); ``sign``
+    of time. It has to pass the switch, because after the turn the field is undefined before the
+    switch, as with ``sqrt(abs(x))``."""
     snaps = undefined.snaps
     flips = snaps[None] & undefined.flips
     moves = snaps & jnp.all(jnp.isfinite(rate), axis=0)
@@ -295,8 +300,8 @@ def _snap(
 
 
 def _with_slope(reach: Array, root: Array, margins: Array, flips: Array) -> Array:
-    """``reach`` with the derivative of the time ``root`` after which the margins (K, B) of the
-    switches ``flips`` vanish, along the secant that gave it."""
+    """``reach`` with the derivatives of the time ``root`` at which the margins (K, B) of the
+    switches ``flips`` vanish, as far as the secant that gave ``root`` depends on these margins."""
     stop_gradient = jax.lax.stop_gradient
     margin = jnp.sum(jnp.where(flips, margins, 0), axis=0)
     present = stop_gradient(margin) > 0
@@ -316,13 +321,13 @@ def _first_width(
 
 
 def _width(progress: Progress, length: Array, is_running: Array, eps: float) -> tuple[Array, Array]:
-    """Width of the step, and whether it leads to the last time."""
+    """Width of the step, and whether it ends at the last time."""
     remaining = length - progress.elapsed
     is_last = remaining <= progress.width * (1 + 1e-9)
-    # no step is much shorter than its neighbours for the sake of the end
+    # the remainder is divided in two so that the last step is not much shorter than the one before
     width = jnp.where(is_last, remaining, jnp.minimum(progress.width, remaining / 2))
-    # the width is the difference of two representable times: otherwise rounding of the sum would
-    # accumulate over thousands of steps
+    # The width is the difference of two representable times; otherwise rounding of the sums would
+    # accumulate over thousands of steps.
     end = progress.elapsed + width
     exact = jax.lax.stop_gradient(end - progress.elapsed - width) + width
     exact = jnp.maximum(exact, eps * end)
@@ -331,7 +336,7 @@ def _width(progress: Progress, length: Array, is_running: Array, eps: float) -> 
 
 def _error_and_tolerance(motion, options, progress, attempt, width, length, eps):
     """Error of a step [rad], its tolerance, the angle of the step [rad], and whether its width is
-    one that stability allows just so."""
+    at the limit of stability."""
     rule = motion.rule
     first_rates, last_rates = attempt.stages[0], attempt.stages[rule.stages - 1]
     change = weighted(rule.weights[rule.stages - 1], attempt.h[None, None] * attempt.stages)
@@ -348,17 +353,17 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
         )
 
     error, *lower_order_errors = map(length_of, rule.errors)
-    # Both estimates of DOP853 are far above the error of its result; their combination falls with
-    # the order of the result, so that the width is chosen by the right power.
-    if lower_order_errors:  # of two estimates as in DOP853, of higher order than either
+    # Each estimate of DOP853 is far above the error of the result. Their combination has the order
+    # of the result, so that the width follows from the right power of the error.
+    if lower_order_errors:
         combined_error = jnp.sqrt(
             error * error + 0.01 * lower_order_errors[0] * lower_order_errors[0]
         )
         error = error * jnp.where(
             combined_error > 0, error / jnp.where(combined_error > 0, combined_error, 1), 0
         )
-    # The combination is far too small where the first estimate vanishes by chance, as it may where
-    # something narrow lies within the step; the difference does not vanish at the same place.
+    # The combination is far too small where the first estimate vanishes by chance, as it may if the
+    # field has a narrow feature within the step. The sixth difference does not vanish there too.
     if rule.difference is not None:
         error = error + control.SIXTH_DIFFERENCE * length_of(rule.difference)
     angle = rate * width
@@ -373,9 +378,9 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
     error, tolerance, angle = (
         jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (tolerance, 1), (angle, 0))
     )
-    # The last two stages stand at the same time: the change of their rates over that of their
-    # states is the fastest rate of decay or growth (Hairer & Wanner, Solving Ordinary Differential
-    # Equations II, section IV.2).
+    # The last two stages are at the same time: the difference of their rates divided by that of
+    # their states estimates the fastest rate of decay or growth (Hairer & Wanner, Solving Ordinary
+    # Differential Equations II, section IV.2).
     apart = [rule.weights[k] for k in (rule.stages - 2, rule.stages - 1)]
     moved = list(attempt.h[None] * weighted(apart[1] - apart[0], attempt.stages))
     change = list(attempt.h[None] * (last_rates - attempt.stages[rule.stages - 2]))
@@ -386,15 +391,16 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
 def _save(
     attempt: Attempt, progress: Progress, storage: Storage, ts, start, elapsed, width
 ) -> tuple[Storage, Array]:
-    """Store the samples up to ``elapsed`` (B,); the index of the next one."""
+    """Store the samples up to ``elapsed`` (B,). Returns the storage and the index of the next
+    sample."""
     size = ts.shape[0]
     base = (size + 1) * jnp.arange(width.shape[0], dtype=progress.place.dtype)
 
     def is_due(place):
         return (place < size) & (jnp.abs(column(ts, place) - start) <= elapsed)
 
-    # One sample of each body at a time. To evaluate all times of the whole motion by their step
-    # afterwards, as diffrax's dense output does, would need the stages of all steps in memory.
+    # One sample of each body per iteration. To evaluate all samples after the integration, as with
+    # diffrax's dense output, the stages of all steps would have to be stored.
     def store_one(carry):
         place, samples = carry
         is_stored = is_due(place)
@@ -424,15 +430,15 @@ def _apply_switch(
     width,
     start,
 ):
-    """Turn the switches that were met, and store events."""
+    """Turn the switches at which the step ends, correct wrong levels, and store events."""
     hit = turn.hit & accepted
     flips = turn.flips & hit[None]
-    # a body whose levels were wrong from the start has refused the step and goes on from there
+    # the step was rejected if levels were wrong at its start; it is repeated with correct levels
     repaired = jnp.any(wrong_levels, axis=0) & (progress.outcome == RUNNING)
     is_at_start = turn.part <= turn.start_fraction
-    # A switch that turns back where it has just turned: once is chance, but at a sliding surface
-    # both sides push towards it and every step is shorter than the one before. Counted, to end
-    # with a status instead of with steps of rounding.
+    # A switch may turn back by chance where it has just turned. On a sliding surface, however, the
+    # fields of both sides point towards the surface, and every step is shorter than the one before.
+    # Such reversals are counted, so that the body ends with the status SLIDING.
     is_reversal = hit & jnp.any(flips & (progress.just_turned > 0), axis=0) & is_at_start
     end_margins = attempt.margins[motion.rule.stages - 1]
     levels = jnp.where(flips, turn.levels, progress.levels)
@@ -442,7 +448,7 @@ def _apply_switch(
     just_turned = pick(
         hit, jnp.where(flips, 1, earlier_turns).astype(just_turned.dtype), just_turned
     )
-    # not at a root: its next one is a switch as any other, however soon
+    # A corrected switch is not at its root, so that its next root counts, however close.
     just_turned = jnp.where(wrong_levels & repaired[None], 0, just_turned)
     progress_after = progress_after._replace(
         levels=levels,
@@ -467,12 +473,12 @@ def _apply_switch(
     is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(
         width
     )  # an event at the start is not one of the motion
-    # Two functions that vanish together: the one that is found later turns at the start of the next
-    # step, and by rounding of its margin back and again. These two turns are no events.
+    # If two event functions vanish at the same time, the second one is located at the start of the
+    # next step. By rounding of its margin it may then turn back and forth; these are not events.
     moment = jnp.maximum(jnp.maximum(jnp.abs(start), progress.elapsed), jnp.abs(attempt.h))
     is_rounding = turn.part * jnp.abs(attempt.h) <= 16 * jnp.finfo(width.dtype).eps * moment
-    # An event costs one row of margins, whatever its kind: it is located by the search for
-    # switches, and only what happens at its root is different.
+    # Events are located by the search for switches; each is one more row of the margins. Only the
+    # action at the root differs.
     for k in range(motion.events):
         row = motion.switches - motion.events + k
         rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign
@@ -480,12 +486,12 @@ def _apply_switch(
         is_event = is_event & ~(is_rounding & (progress.just_turned[row] > 0))
         if options.directions[k]:
             is_event = is_event & (rises == options.directions[k])
-        # lanes have no branches: every body writes, those without an event into the bin
+        # lanes have no branches: a body without an event writes to its dummy row
         rows = base + jnp.where(is_event & (count < capacity), count, capacity)
-        if options.terminal[k]:  # stored in any case, for it is where the motion ends
+        if options.terminal[k]:  # always stored: it is the end of the motion
             rows = jnp.where(is_event & (count >= capacity), base + capacity - 1, rows)
         t = start + sign * progress_after.elapsed
-        # a half more where the function is positive after the event
+        # index of the event function, plus 0.5 if the function is positive after the event
         which = k + jnp.where(turn.levels[row] > 0, 0.5, 0.0).astype(t.dtype)
         storage = storage._replace(
             times=put(storage.times, rows, t[:, None]),
@@ -504,9 +510,9 @@ def _apply_switch(
 def _with_coincident_switch(
     motion, progress, progress_after, rate, wrong_levels, ts, start
 ) -> Array:
-    """The state after switches ``wrong_levels`` have turned where another one has just turned, with
-    the derivative by the time at which each turns by itself (two pulses, of which one begins where
-    the other ends); ``rate`` (D, B): rates before they turned."""
+    """The state after switches ``wrong_levels`` have turned immediately after another one, with the
+    derivative by the time of each switch that has a root of its own, such as that of a pulse that
+    begins when another one ends. ``rate`` (D, B): rates before they turned."""
     sign = jnp.where(ts[-1] < start, -1, 1).astype(rate.dtype)
     t, y = start + sign * progress_after.elapsed, progress_after.y
     flips = wrong_levels & (progress.levels != progress_after.levels)
@@ -525,14 +531,15 @@ def _with_coincident_switch(
 
 
 def turns_by_itself(margins: Array, slopes: Array, length: Array) -> Array:
-    """Whether switches that turn after another one, at the same time, stand at roots of their own;
-    others turn because that one has moved what they compare, as in a search in a table."""
+    """Whether switches that turn immediately after another one are at roots of their own margins.
+    Otherwise they turn because their argument depends on the other switch, as in a search in a
+    table."""
     near = control.COINCIDENT * length[None] * jnp.abs(slopes)
     return (slopes != 0) & (jnp.abs(margins) <= near)
 
 
 def _outcome(options, progress: Progress, is_running, length, ratio, eps) -> Array:
-    """Whether each body is still running, or why not."""
+    """The outcome of each body: RUNNING, or the reason why it has stopped."""
     attempts = control.ATTEMPTS * options.max_steps
     spent = (progress.steps >= options.max_steps) | (progress.attempts >= attempts)
     is_too_short = ~(progress.width > control.MIN_WIDTH * eps * length)

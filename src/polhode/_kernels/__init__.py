@@ -1,7 +1,7 @@
-"""What makes XLA's CPU backend fast: one compiled unit, coefficients folded beforehand.
+"""Optimisations for XLA's CPU backend (fused kernels, partial evaluation) and derivative rules.
 
-Nothing here changes a result by more than rounding. `README.md` beside this file says what each
-part buys, ``polhode._policy`` where it is used and how all of it is switched off.
+They change results by rounding at most. `README.md` in this folder describes each optimisation and
+its gain; ``polhode._policy`` contains their thresholds and the switch that turns all of them off.
 """
 
 from polhode._kernels._calls import Distinct as Distinct, jit_distinct as jit_distinct

@@ -1,9 +1,9 @@
 """Calls of compiled programs.
 
 ``jit_distinct`` calls a compiled program with arrays as operands and all else as static arguments.
-Arrays that stand in several places of a pytree, such as one orbit in several parts of a scene, stay
-one array in the program: otherwise every leaf would be an operand of its own, and what depends on
-the same array would be computed twice.
+An array that occurs several times in a pytree, such as an orbit in several parts of a scene, is one
+operand of the program. ``jax.jit`` would make an operand of every leaf, and values that depend on
+the array would be computed several times.
 """
 
 import functools
@@ -16,7 +16,7 @@ import numpy as np
 
 
 class Distinct(eqx.Module):
-    """A pytree with each of its leaves once; ``places`` (static): which leaf stands where."""
+    """A pytree flattened to its distinct leaves; ``places[k]`` (static) is the index of leaf k."""
 
     leaves: list[Any]
     places: tuple[int, ...] = eqx.field(static=True)
@@ -29,13 +29,13 @@ class Distinct(eqx.Module):
         self.leaves = list({id(x): x for x in leaves}.values())
 
     def value(self) -> Any:
-        """The pytree; what was one array in several places is so again."""
+        """The pytree, in which leaves that were the same array are the same array again."""
         return jax.tree.unflatten(self.tree, [self.leaves[i] for i in self.places])
 
 
 class _Static(NamedTuple):
-    """All of a pytree but its arrays, hashable: ``sources`` holds for each leaf the number of its
-    array, or the leaf itself within a tuple."""
+    """A pytree without its arrays, hashable. ``sources`` contains, for each leaf, the number of its
+    array, or a tuple with the leaf itself."""
 
     tree: Any
     sources: tuple[int | tuple[Any], ...]
@@ -47,8 +47,8 @@ class _Static(NamedTuple):
 
 def _split(value: Any) -> tuple[_Static, list[Any]]:
     """The static part of a pytree, and its arrays, each once."""
-    # One loop over the leaves. ``eqx.filter_jit`` partitions and combines trees instead, and a call
-    # takes three times as long.
+    # One loop over the leaves. ``eqx.filter_jit`` partitions and combines trees instead, which
+    # makes a call take three times as long.
     leaves, tree = jax.tree.flatten(value)
     arrays: list[Any] = []
     numbers: dict[int, int] = {}
@@ -69,7 +69,7 @@ _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 @jax.tree_util.register_static
 class _Constant:
-    """A static value among the results of a program."""
+    """A static value returned by a compiled program, which JAX stores in the output's tree."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -82,11 +82,11 @@ class _Constant:
 
 
 def jit_distinct(fn: Callable) -> Callable:
-    """``jax.jit`` for functions of pytrees that hold more than arrays, such as scenes and methods.
+    """``jax.jit`` for functions of pytrees that contain more than arrays, such as scenes.
 
-    One compiled program for each structure of the arguments, in the cache of ``jax.jit``: scenes
-    that differ in numbers share it. Unlike with ``eqx.filter_jit`` arrays that stand in several
-    places stay one in the program, and a call costs a third.
+    ``jax.jit`` caches one compiled program for each structure of the arguments; scenes that differ
+    in numbers share it. Unlike with ``eqx.filter_jit``, an array that occurs several times is one
+    operand, and a call takes a third of the time.
     """
 
     @functools.partial(jax.jit, static_argnums=0)

@@ -1,9 +1,9 @@
-"""Derivative rules that JAX does not have.
+"""Derivative rules that JAX does not provide.
 
-Two primitives: a linear map that one program computes and another transposes, such as ``spread``;
-and values with a rule for their derivatives, whatever computed them. Also values without known
-derivatives, which become NaN or raise, and functions that are smooth although they contain
-comparisons.
+Two primitives: ``linear``, a linear map with a separate program for its transpose, as in
+``spread``; and ``attached``, which attaches a derivative rule to values computed elsewhere. Also
+values whose derivatives are not known, so that derivatives are NaN or raise an error, and functions
+that are smooth although they contain comparisons.
 """
 
 import functools
@@ -36,14 +36,17 @@ def linear(
     """``forward(constants, operands)``, linear in ``operands``; ``backward(constants, out)`` is its
     transpose.
 
-    All are lists of arrays; ``like``: arrays of the shapes and dtypes of the result. Neither
-    function may close over traced values. ``compiled``, such as ``kernel``, is applied to either
-    as a function of arrays where a program is made of it, not where it is differentiated. Unlike
-    ``jax.custom_vjp`` this leaves forward mode as it is, and unlike
-    ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with respect to
-    ``constants``. ``reverse_error``: message of the NotImplementedError that reverse mode by
-    ``constants`` raises, for functions with loops of unknown length, which JAX cannot transpose;
-    so does the transpose of a map without ``backward``.
+    All arguments and results are lists of arrays. Neither function may close over traced values.
+    Unlike ``jax.custom_vjp`` this permits forward mode, and unlike
+    ``jax.custom_derivatives.linear_call`` it permits ``vmap`` and derivatives with respect to
+    ``constants``.
+
+    - ``like``: arrays with the shapes and dtypes of the result.
+    - ``compiled``: a transformation such as ``kernel``, applied to either function when it is
+      lowered, and not when it is differentiated.
+    - ``reverse_error``: message of the NotImplementedError of reverse mode with respect to
+      ``constants``, for functions with loops of unknown length, which JAX cannot transpose. The
+      transpose of a map whose ``backward`` is None raises it as well.
     """
     shapes = tuple((tuple(x.shape), x.dtype) for x in like)
     return _linear_p.bind(
@@ -68,7 +71,8 @@ def _compute(*arrays, forward, backward, count, shapes, compiled, reverse_error)
 
 
 def _lowered(*arrays, compiled, **params):
-    with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # a unit's mark is its call's
+    # the attributes of a unit belong to its call, not to calls inside it
+    with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
         compute = functools.partial(_compute, compiled=None, **params)
         return (compute if compiled is None else compiled(compute))(*arrays)
 
@@ -80,7 +84,7 @@ def _shapes(*_, forward, backward, count, shapes, compiled, reverse_error):
 
 def _jvp(arrays, tangents, *, count, **params):
     # The map is linear in its operands and any function of the constants. Its tangent is the map of
-    # the tangents plus the derivative by the constants, which JAX takes through ``forward``.
+    # the tangents plus the derivative by the constants, for which JAX differentiates ``forward``.
     out = _linear_p.bind(*arrays, count=count, **params)
     constants, operands = arrays[:count], arrays[count:]
     operand_tangents = tangents[count:]
@@ -97,7 +101,7 @@ def _jvp(arrays, tangents, *, count, **params):
 
 
 def _by_constants(constants, operands, tangents, out, *, forward, reverse_error, **_):
-    """Change of the map for changes of its constants."""
+    """Tangents of the map along the tangents of its constants."""
     if not reverse_error:
         return along_slopes(lambda inputs: forward(inputs, operands), constants, tangents)
     at = [i for i, x in enumerate(tangents) if is_slope(x)]
@@ -117,7 +121,7 @@ def _by_constants(constants, operands, tangents, out, *, forward, reverse_error,
 
 
 def is_slope(x: Any) -> bool:
-    """Whether a tangent is present: neither a symbolic zero nor that of an integer."""
+    """Whether a tangent is an array of floats: neither a symbolic zero nor that of an integer."""
     return not isinstance(x, ad.Zero) and x.dtype != jax.dtypes.float0
 
 
@@ -139,8 +143,8 @@ def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled, reve
 
 
 def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, reverse_error):
-    # All operands get the axis, batched or not: the transpose has to return cotangents of the same
-    # shapes. The constants have no cotangents here, and keep their axes.
+    # All operands get the axis, batched or not, because the transpose has to return cotangents of
+    # the same shapes. The constants have no cotangents here; only batched ones have the axis.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     given_dims, operands = dims[:count], []
     for x, d in zip(arrays[count:], dims[count:]):
@@ -175,10 +179,10 @@ mlir.register_lowering(_linear_p, mlir.lower_fun(_lowered, multiple_results=True
 
 
 def spread(values: Any, axis: int, count: int) -> Any:
-    """Every array of a tree ``count`` times along a new axis.
+    """Every array of a tree, repeated ``count`` times along a new axis.
 
-    Unlike in a broadcast, cotangents are summed in a loop, which a unit can contain; XLA computes
-    the sum of a large array by a library call, which it cannot.
+    Unlike in ``jnp.broadcast_to``, cotangents are summed in a loop, which a unit can contain. XLA
+    computes the sum of a large array by a library call, which a unit cannot contain.
     """
     leaves, tree = jax.tree.flatten(values)
     floats = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
@@ -199,7 +203,6 @@ def spread(values: Any, axis: int, count: int) -> Any:
         def add(i, total):
             return [a + b for a, b in zip(total, row(i))]
 
-        # few rows are added one by one
         if count <= _policy.SUM_ROWS:
             return functools.reduce(lambda total, i: add(i, total), range(1, count), row(0))
         return jax.lax.fori_loop(1, count, add, row(0))
@@ -223,21 +226,22 @@ def attached(
     values: Sequence[Any],
     again: Callable[[Sequence[Any]], tuple[Sequence[Any], Any]] | None = None,
 ) -> list[Any]:
-    """``values``, a function of ``operands`` computed elsewhere, with its derivatives.
+    """``values``, a function of ``operands`` that was computed elsewhere, with a derivative rule.
 
-    ``rule(operands, tangents, values)``: the tangents of the values, or of the first of them if the
-    others have none; those of operands may be absent (``is_slope``). It may not close over traced
-    values. Derivatives of the rule see the values with their derivatives. Unlike ``jax.custom_jvp``
-    this is never replaced by the function itself, as loops do on the way to second derivatives.
+    ``rule(operands, tangents, values)`` returns the tangents of the values, or of the first few
+    values if the others have none. Tangents of operands may be symbolic zeros (``is_slope``). The
+    rule may not close over traced values. It is given the values with this rule attached, so that
+    it can be differentiated again. Loops replace a ``jax.custom_jvp`` by the function itself before
+    second derivatives are taken; this primitive is never replaced.
 
-    ``again(operands)``: where derivatives are taken, the values are computed by this function
-    instead, together with something that helps the rule, its fourth argument.
+    ``again(operands)``: if given, a program that computes derivatives computes the values by this
+    function instead. It also returns auxiliary data, which the rule gets as its fourth argument.
     """
     return _attached_p.bind(*operands, *values, rule=rule, count=len(operands), again=again)
 
 
 def along_slopes(function: Callable, operands: Sequence[Any], tangents: Sequence[Any]) -> Any:
-    """Tangents of ``function(operands)`` along those of ``tangents`` that are slopes."""
+    """Tangents of ``function(operands)``; ``tangents`` may contain symbolic zeros."""
     at = [i for i, x in enumerate(tangents) if is_slope(x)]
 
     def of_sloped(*parameters):
@@ -252,8 +256,8 @@ def along_slopes(function: Callable, operands: Sequence[Any], tangents: Sequence
 def attached_to(
     function: Callable[..., Sequence[Array]], arguments: Any, values: Sequence[Array]
 ) -> list[Array]:
-    """``values`` of ``function(*arguments)``, found in another way, with its derivatives: it is not
-    evaluated where none are taken. It may close over traced values."""
+    """``values`` of ``function(*arguments)``, computed in another way, with the derivatives of
+    ``function``, which is evaluated for derivatives only. It may close over traced values."""
     leaves, tree = jax.tree.flatten(arguments)
     closed = jax.make_jaxpr(lambda *x: list(function(*jax.tree.unflatten(tree, x))))(*leaves)
     size = len(closed.consts)
@@ -282,9 +286,9 @@ def _shapes_of_values(*avals, rule, count, again):
 
 
 def _attached_jvp(arrays, tangents, *, rule, count, again):
-    # The rule sees ``out``, values with their derivatives, so derivatives of the rule are second
-    # derivatives. Tangents of the values themselves are dropped: those are derivatives of how the
-    # values were computed.
+    # The rule is given ``out``, the values with their derivative rule, so that differentiating the
+    # rule gives second derivatives. Tangents of ``values`` are dropped: they are the derivatives of
+    # the program that computed the values.
     operands, values, help_of_rule = arrays[:count], arrays[count:], []
     is_sloped = any(is_slope(x) for x in tangents[:count])
     if is_sloped and again is not None:
@@ -295,8 +299,8 @@ def _attached_jvp(arrays, tangents, *, rule, count, again):
 
 
 def _attached_batch(arrays, dims, *, rule, count, again):
-    # Operands keep their axes, so that what the whole batch shares, such as the weights of a
-    # network, is not multiplied; all values have the axis.
+    # Operands common to the batch, such as the weights of a network, are not broadcast; all values
+    # get the axis.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     axes = [None if d is None else 0 for d in dims[:count]]
     operands = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(arrays, dims[:count])]
@@ -337,8 +341,8 @@ mlir.register_lowering(_attached_p, mlir.lower_fun(_values, multiple_results=Tru
 
 
 def is_differentiated(arrays: Sequence[Any]) -> Array:
-    """False; True in a program that computes a derivative along any of ``arrays``, the value that
-    comes with it included."""
+    """False; True in a program that computes a derivative along any of ``arrays``, in the
+    computation of its value as well."""
     return _is_differentiated_p.bind(*arrays)
 
 
@@ -373,14 +377,15 @@ mlir.register_lowering(
 )
 
 
-# Values whose derivatives are not known: they become NaN, never numbers that are wrong.
+# Values whose derivatives are not known: the derivatives are NaN rather than wrong numbers.
 
 
 @jax.custom_jvp
 def underivable(x: Array, where: Array) -> Array:
-    """``x``, with NaN for its derivatives ``where`` (of the shape of x) it has a tangent.
+    """``x``, whose derivatives are NaN where the mask ``where`` (of the shape of x) is true.
 
-    Tangents and cotangents that are zero stay zero: what does not depend on ``x`` is not affected.
+    Tangents and cotangents that are zero stay zero, so that derivatives in other directions are not
+    affected.
     """
     del where
     return x
@@ -395,14 +400,14 @@ def _underivable_rule(primals, tangents):
 
 
 def _nan_tangents(constants: Any, tangents: Any) -> list[Array]:
-    # Zero tangents pass: under ``vmap`` over the columns of a Jacobian, and in batches, most
-    # directions do not move ``x`` at all.
+    # Zero tangents stay zero: in a Jacobian by ``vmap``, and in batches, ``x`` does not change in
+    # most of the directions.
     (where,), (tangent,) = constants, tangents
     return [jnp.where(where & (tangent != 0), np.nan, tangent)]
 
 
 def without_derivatives(tree: Any, why: str) -> Any:
-    """The same arrays, whose derivatives raise NotImplementedError with the words ``why``."""
+    """The same arrays, whose derivatives raise NotImplementedError with the message ``why``."""
 
     @jax.custom_jvp
     def same(x):
@@ -416,16 +421,16 @@ def without_derivatives(tree: Any, why: str) -> Any:
 
 
 def are_close(first: Array, second: Array) -> Array:
-    """Where two numbers agree to half of their digits."""
+    """Where two numbers agree to half of their digits (relative difference of sqrt(eps))."""
     limit = jnp.finfo(first.dtype).eps ** 0.5
     return jnp.abs(first - second) <= limit * jnp.maximum(jnp.abs(first), jnp.abs(second))
 
 
 def over_gap(entry: Array, first: Array, second: Array) -> Array:
-    """``entry / (first - second)`` of an entry whose value is zero; all of one shape.
+    """``entry / (first - second)`` for an ``entry`` whose value is zero; all of one shape.
 
-    It counts in derivatives alone. Where the two agree to half of their digits the derivative by
-    the entry is NaN: it loses digits in proportion to their relative difference.
+    The value is zero; only the derivative with respect to ``entry`` matters. It is NaN where the
+    two numbers agree to half of their digits, because the difference has lost the other half.
     """
     is_close = are_close(first, second)
     return underivable(entry, is_close) / jnp.where(is_close, 1, first - second)
@@ -433,8 +438,8 @@ def over_gap(entry: Array, first: Array, second: Array) -> Array:
 
 @jax.custom_jvp
 def derivable_once(x: Array, where: Array) -> Array:
-    """``x`` (..., n) with its first derivatives, and NaN for the second ones by any two of its last
-    axis ``where`` they are taken."""
+    """``x`` (..., n) with its first derivatives; second derivatives by any two entries of the last
+    axis are NaN where the mask ``where`` is true."""
     del where
     return x
 
@@ -442,20 +447,21 @@ def derivable_once(x: Array, where: Array) -> Array:
 @derivable_once.defjvp
 def _once_rule(primals, tangents):
     x, where = primals
-    # one in value; its own derivative by any entry of the axis is NaN, and reaches the tangents
+    # The value is one, and its derivative by any entry of the axis is NaN. As a factor of the
+    # tangents it makes their derivatives NaN.
     one = 1 + jnp.sum(underivable(x, where) - x, axis=-1, keepdims=True)
     return derivable_once(x, where), tangents[0] * one
 
 
-# Functions that are smooth although they compare.
+# Functions that are smooth although they contain comparisons.
 
 
 SMOOTH = "smooth_function"
-"""Name of the calls of such functions, in which no kink is looked for."""
+"""Name of the calls of such functions, in which the search for switches finds none."""
 
 
 def smooth(fn: Callable) -> Callable:
-    """``fn``, which chooses between formulas of the same value: its comparisons make no kink."""
+    """``fn``, whose comparisons choose between formulas of equal value and make no kink."""
 
     def smooth_function(*args):
         return fn(*args)

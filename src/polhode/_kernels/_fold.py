@@ -1,10 +1,10 @@
-"""Partial evaluation of a traced function: what does not depend on the state is computed once.
+"""Partial evaluation of a traced function: terms that do not depend on the state are computed once.
 
 A program made by automatic differentiation contains sums with zero, products with one and products
-of parameters. They would be evaluated again in every call and, since XLA gives each output array a
-loop of its own, for every component. Here they are folded into few coefficients before the loop,
-and values that several results share are staged. The result differs from that of the original
-function by rounding, because products are reassociated.
+of parameters. They would be evaluated again in every call and, since XLA computes each output array
+in a loop of its own, for every component. Here they are folded into few coefficients before the
+integration loop, and values that several results share are staged. Results differ from those of the
+original function by rounding, because products are reassociated.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from jaxtyping import Array
 
 from polhode import _policy
 
-# Staging: values that are computed once, and not again in every loop that uses them.
+# Staging: values that XLA computes once, and not again in every loop that uses them.
 
 
 def opaque_ones(x: Array) -> Array:
@@ -38,12 +38,13 @@ def opaque_ones(x: Array) -> Array:
 
 
 def staged(values: Any, *ones: Array) -> Any:
-    """The same values, each divided by the ``ones`` of its own shape.
+    """The same values, each divided by the ``ones`` of its shape (see ``opaque_ones``).
 
-    XLA repeats cheap arithmetic in every fused loop that needs its result, but never a division;
-    optimisation barriers do not help, since it removes them before it fuses on the CPU. The ones
-    must have every axis of the value, also for one body: a division by a broadcast scalar becomes
-    a multiplication. Conditions are staged as numbers; integers are returned unchanged.
+    XLA repeats cheap arithmetic in every fused loop that needs its result, but never a division.
+    Optimisation barriers do not prevent this, since XLA removes them on the CPU before it fuses
+    loops. The ones must have every axis of the value, even for one body: XLA converts a division by
+    a broadcast scalar to a multiplication. Conditions are staged as numbers; integers are returned
+    unchanged.
     """
 
     if not _policy.is_staged():
@@ -61,8 +62,8 @@ def staged(values: Any, *ones: Array) -> Any:
     return jax.tree.map(divided, values)
 
 
-# A division whose divisor has every axis of the value under ``jax.vmap`` too: that of a derivative
-# in many directions would otherwise be broadcast along them.
+# A division whose divisor has every axis of the value under ``jax.vmap`` as well. In a derivative
+# in many directions only the tangent has the axis of the directions; JAX would broadcast the ones.
 _stage_p = Primitive("stage")
 _stage_p.def_impl(jax.lax.div)
 _stage_p.def_abstract_eval(lambda x, _: ShapedArray(x.shape, x.dtype))
@@ -86,7 +87,7 @@ def _stage_batch(arrays, dims):
         for a, d in zip((x, one), dims)
     )
     if dims[1] is None:
-        # ones along the new axis that XLA does not recognise as ones either
+        # ones that XLA does not recognise as ones, along the new axis
         axis = 1 + (jax.lax.broadcasted_iota(jnp.int32, one.shape, 0) >> 31).astype(one.dtype)
         one = one * axis
     return _stage_p.bind(x, one), 0
@@ -99,9 +100,9 @@ batching.primitive_batchers[_stage_p] = _stage_batch
 
 
 def computed_once(values: Any) -> Any:
-    """The same values behind an optimisation barrier, before which XLA does not repeat arithmetic.
+    """The same values behind an optimisation barrier: XLA does not repeat the arithmetic before it.
 
-    It works for passes that come before fusion; see ``staged`` for those that come after.
+    The barrier affects the passes before fusion only; ``staged`` affects fusion.
     """
     return jax.lax.optimization_barrier(values) if _policy.is_staged() else values
 
@@ -114,7 +115,7 @@ _FOLDS = {
     "div": np.divide,
     "neg": np.negative,
 }
-"""Operations on numbers that are known while tracing."""
+"""Operations that NumPy evaluates if all operands are numbers known while tracing."""
 
 _ELEMENTWISE = frozenset(
     (*_FOLDS, *"integer_pow square sqrt rsqrt sin cos exp log abs sign max min copy".split())  # noqa: SIM905
@@ -124,7 +125,7 @@ _BY_ENTRY = _ELEMENTWISE | frozenset(
      exp2 expm1 floor ge gt is_finite le log1p logistic lt ne not or pow rem round select_n sinh
      stop_gradient tan tanh""".split()  # noqa: SIM905
 )
-"""Operations that treat the entries of arrays of one shape separately."""
+"""Operations on arrays of one shape that act on each entry separately."""
 
 _TAKING_APART = frozenset(
     """broadcast_in_dim convert_element_type copy gather reshape slice split squeeze stop_gradient
@@ -134,7 +135,7 @@ _CALLS = frozenset(("jit", "pjit", "closed_call"))
 
 
 class _Held(NamedTuple):
-    """A value known before the loop: an array, or one number that stands for a whole array."""
+    """A value that does not depend on the state: an array, or a number broadcast to an array."""
 
     value: Any
 
@@ -149,9 +150,11 @@ class _Held(NamedTuple):
 
 
 class _Slot(NamedTuple):
-    """A value of the loop: that of number ``index`` times ``sign``, and ``scale`` if there is one.
+    """A value that depends on the state: value number ``index`` of the loop times ``sign``, times
+    ``scale`` if there is one.
 
-    ``factors``: of a product with that scale, the plain factor and the one that brought it.
+    ``factors``: if the value is a product and the scale comes from one of its two factors, the
+    numbers of the factor without a scale and of the one with it.
     """
 
     index: int
@@ -162,18 +165,20 @@ class _Slot(NamedTuple):
 
 
 MIXED = (-1,)
-"""In place of a shape: the entries of a coefficient are no entries of the state, as in a product
-with a matrix."""
+"""In place of a shape, for a coefficient that an operation does not combine with the state entry by
+entry, such as a matrix."""
 
 
 class Specialised(NamedTuple):
-    """``coefficients``: arrays computed before the loop; ``run(coefficients, *state_leaves)``: the
-    results.
+    """A partially evaluated program.
 
-    ``shapes``: the shapes to which the loop broadcasts each, and ``MIXED`` for one whose entries an
-    operation mixes; where there is one shape only, an array of it may stand in its place, whose
-    entries belong to those of the state. ``by_entry``: whether every operation treats the entries
-    of the state's arrays separately, so that ``run`` takes any number of them.
+    - ``coefficients``: arrays computed before the loop;
+    - ``run(coefficients, *state_leaves)``: the results;
+    - ``shapes``: for each coefficient, the shapes to which the loop broadcasts it, and ``MIXED`` if
+      an operation mixes its entries. A coefficient with one shape only may be replaced by an array
+      of that shape, with a value for each entry of the state;
+    - ``by_entry``: whether every operation acts on each entry of the state separately, so that
+      ``run`` accepts arrays of any length.
     """
 
     coefficients: tuple[Any, ...]
@@ -183,8 +188,9 @@ class Specialised(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """An operation of the loop; ``operands``: where it finds each, its aval, to what shape;
-    ``by_entry``: whether entries of its arrays have nothing to do with one another."""
+    """An operation of the loop. ``operands``: for each the number of a loop value or a ``_Held``,
+    its aval, and the shape to which it is broadcast. ``by_entry``: whether it acts on each entry
+    separately."""
 
     outputs: list[int]
     bind: Any
@@ -197,8 +203,9 @@ def specialise(
 ) -> Specialised:
     """Compute the part of ``closed_jaxpr`` that depends on its first ``arguments`` alone.
 
-    Without ``fold`` these arguments are only sliced and reshaped, without arithmetic. Without
-    ``stage`` no values are staged: for a program that will be specialised again.
+    The remaining inputs of the program are the state. Without ``fold`` the arguments are only
+    sliced and reshaped, without arithmetic. Without ``stage`` no values are staged: for a program
+    that is specialised again later.
     """
     if _policy.is_plain():
         shapes = tuple(frozenset([jnp.shape(x), MIXED]) for x in arguments)
@@ -208,7 +215,7 @@ def specialise(
             shapes,
             False,
         )
-    # ``instantiate=True`` keeps operands that go unused: the first ones are counted by place.
+    # ``instantiate=True`` keeps unused operands, because the arguments are identified by position
     jaxpr, _ = partial_eval.dce_jaxpr(
         closed_jaxpr.jaxpr, [True] * len(closed_jaxpr.out_avals), True
     )
@@ -229,8 +236,8 @@ def specialise(
         if isinstance(x, _Held) and x.number is None:
             shapes_of[x.key].add(MIXED)
     places = {key: place for place, key in enumerate(coefficients)}
-    # Where every operation treats entries separately, and every array is a number or of the shape
-    # of the state, the program is traced for one shape and run for any.
+    # If every operation acts on each entry separately, and every array is a number or has the shape
+    # of the state, the program traced for one shape can be run for any other.
     lane = slots[-1].aval.shape
     by_entry = all(step.by_entry for step in steps)
     for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
@@ -264,7 +271,7 @@ def specialise(
 
 
 def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
-    """The steps that the results depend on, and those without results, which print or check."""
+    """The steps on which the results depend, and those with side effects only (prints, checks)."""
     values = {x for x, *_ in out if not isinstance(x, _Held)}
     needed_steps = []
     for step in reversed(steps):
@@ -276,18 +283,17 @@ def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
 
 def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
     """Values that several results depend on and that take enough operations to be staged."""
-    # XLA fuses per result: a value is repeated for each result that it leads to, not for each of
-    # its users. So both are counted, and the work that staging would save is the number of
-    # operations between a value and the nearest staged ones before it (``behind``).
+    # XLA fuses one loop for each result: a value is repeated for each result that depends on it,
+    # not for each operation that uses it. A value is therefore staged only if it has several of
+    # both. The work that staging saves is the number of operations between a value and the nearest
+    # staged values before it (``behind``).
     makers = {i: k for k, step in enumerate(steps) for i in step.outputs}
 
     def of(operands):
         return {i for i, *_ in operands if not isinstance(i, _Held) and i in makers}
 
     users = dict.fromkeys(makers, 0)
-    dependent_results: dict[int, set[int]] = {
-        i: set() for i in makers
-    }  # the results that rest on it
+    dependent_results: dict[int, set[int]] = {i: set() for i in makers}
     for k, operand in enumerate(out):
         for i in of([operand]):
             users[i] += 1
@@ -297,7 +303,7 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
             users[i] += len(step.outputs)
             dependent_results[i].update(*(dependent_results[made] for made in step.outputs))
     shared: set[int] = set()
-    behind: dict[int, set[int]] = {}  # the operations that a fused loop repeats for it
+    behind: dict[int, set[int]] = {}  # operations that a fused loop repeats to compute the value
     for k, step in enumerate(steps):
         work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
         for i in step.outputs:
@@ -308,21 +314,24 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
 
 
 def _shaped(operation: Any, avals) -> Any:
-    """The key of an operation with the shapes of its inputs: a broadcast number stays one number,
-    whose sum or place in a concatenation depends on the shape that it stands for."""
+    """The key of an operation together with the shapes of its inputs.
+
+    A broadcast number is stored as one number; the result of a sum or a concatenation depends on
+    the shape to which it is broadcast."""
     return None if operation is None else (operation, *(aval.shape for aval in avals))
 
 
 class _Work:
-    """One pass over a jaxpr: computes what is known, and records the other operations."""
+    """One pass over a jaxpr: evaluates operations that do not depend on the state, and records the
+    others."""
 
     def __init__(self, fold: bool):
         self.fold = fold
         self.steps: list[_Step] = []
         self.count = 0
         self.scaled: dict[Any, int] = {}
-        self.results: dict[Any, list[Any]] = {}  # results of operations, by what they are made of
-        self.referenced: list[Any] = []  # whose ids are keys above
+        self.results: dict[Any, list[Any]] = {}  # results by operation and inputs
+        self.referenced: list[Any] = []  # arrays whose ids are in the keys above
 
     def slot(self, aval) -> _Slot:
         self.count += 1
@@ -331,9 +340,9 @@ class _Work:
     def once(self, key, inputs, outs, make: Callable[[], list[Any]]) -> list[Any]:
         """The result of ``make``, cached by operation and inputs (common subexpressions).
 
-        ``key``: of the operation and the shapes of its inputs; None where it cannot be compared
-        with others. Parts of a scene that share arrays, such as one orbit, are therefore evaluated
-        once.
+        ``key`` identifies the operation and the shapes of its inputs; it is None for an operation
+        that cannot be hashed. Arrays that several parts of a scene share, such as an orbit, are
+        thereby evaluated once.
         """
         if key is None:
             return make()
@@ -358,7 +367,7 @@ class _Work:
         return self.once(_shaped(key, avals), [x for x, *_ in operands], outs, make)
 
     def operand(self, x) -> Any:
-        """A value known before the loop, or the number of one that the loop has made."""
+        """A value as an operand of a step: a ``_Held``, or the number of a value of the loop."""
         if isinstance(x, _Held):
             self.referenced.append(x.value)
             return x
@@ -369,16 +378,16 @@ class _Work:
 
     def unsigned(self, x: _Slot) -> int:
         """The number of a value with its scale, but without its sign."""
-        # Scales and signs are multiplied out only where an operation needs the value itself: until
-        # then products of parameters combine before the loop, and a sign turns a sum into a
-        # difference, which costs nothing.
+        # Scales and signs are multiplied out only when an operation needs the value itself. Until
+        # then products of parameters are combined before the loop, and a sign changes a sum to a
+        # difference at no cost.
         if x.scale is None:
             return x.index
         key = (x.index, x.scale.key)
         if key not in self.scaled:
             self.referenced.append(x.scale.value)
             a, b = _Slot(x.index, x.aval), x.scale
-            if x.factors is not None:  # the scaled factor is likely to be met again
+            if x.factors is not None:  # other products are likely to use the scaled factor as well
                 a, scaled_factor = (_Slot(index, x.aval) for index in x.factors)
                 b = _Slot(self.unsigned(scaled_factor._replace(scale=x.scale)), x.aval)
             self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval], "mul")[0].index
@@ -418,10 +427,10 @@ class _Work:
         return self.emit(_binder(eqn), operands, avals, outs, _operation(eqn), name)
 
     def evaluate(self, eqn, operands) -> list[_Held]:
-        """An equation before the loop; numbers stay numbers as long as they can."""
+        """The results of an equation that does not depend on the state, as numbers if possible."""
         name, out = eqn.primitive.name, eqn.outvars[0].aval
-        # Only numbers can be compared with 0 and 1, and so remove an operation: they are computed
-        # by NumPy, never as arrays. A broadcast number stays one number, and not an array to read.
+        # Only NumPy numbers can be compared with 0 and 1 while tracing, and thereby remove an
+        # operation. A broadcast number is stored as one number, so that no array has to be read.
         single = all(np.ndim(x.value) == 0 for x in operands)
         if operands and single and name == "broadcast_in_dim":
             return operands
@@ -436,11 +445,12 @@ class _Work:
         return [_Held(x) for x in (results if isinstance(results, list | tuple) else [results])]
 
     def simplify(self, name, operands, aval) -> _Held | _Slot | None:
-        """An operation with a known zero or factor, simplified; None where it is not."""
+        """An operation with a zero or a factor that does not depend on the state, simplified; None
+        if it cannot be."""
         if not jnp.issubdtype(aval.dtype, jnp.floating):  # complex numbers have no sign
             return None
         if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in operands):
-            return None  # one number of the loop meets an array
+            return None  # a scalar that depends on the state is broadcast to an array
         if name == "neg":
             return self.times(operands[0], _Held(aval.dtype.type(-1)), aval)
         if name in ("add", "add_any", "sub"):
@@ -454,15 +464,15 @@ class _Work:
                 a, b = b, a
             return self.times(a, b, aval) if isinstance(b, _Held) else self.product(a, b, aval)
         if name == "div" and isinstance(operands[1], _Held) and operands[1].number is not None:
-            # The reciprocal of a power of two is exact; with another the product would have one
-            # rounding error more than the quotient.
+            # The reciprocal of a power of two is exact. With any other reciprocal the product has
+            # one rounding error more than the quotient.
             mantissa, _ = np.frexp(operands[1].number)
             if abs(mantissa) == 0.5:
                 return self.times(operands[0], _Held(aval.dtype.type(1 / operands[1].number)), aval)
         return None
 
     def sum(self, a, b, aval) -> _Held | _Slot:
-        """The sum of two values, at least one of them of the loop."""
+        """The sum of two values, of which at least one depends on the state."""
         if isinstance(a, _Held):
             a, b = b, a
         if isinstance(b, _Held):
@@ -486,7 +496,7 @@ class _Work:
         return total._replace(scale=scale, sign=a.sign)
 
     def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
-        """The product of two values of the loop; a scale of either becomes one of the product."""
+        """The product of two values that depend on the state; it takes over their scales."""
         # sorted, so that x y and y x are one product
         unscaled = [_Slot(index, aval) for index in sorted((a.index, b.index))]
         (result,) = self.emit(lax.mul, unscaled, [aval] * 2, [aval], "mul")
@@ -500,7 +510,7 @@ class _Work:
         return product
 
     def combine(self, name: str, a: _Held, b: _Held, aval) -> _Held:
-        """Sum, difference or product of two known values; the same one when met again."""
+        """Sum, difference or product of two values that do not depend on the state (cached)."""
         if a.number is not None and b.number is not None:
             return _Held(aval.dtype.type(_FOLDS[name](a.number, b.number)))
 
@@ -511,12 +521,12 @@ class _Work:
         return self.once(("combined", name), [a, b], [aval], make)[0]
 
     def times(self, x, factor: _Held, aval) -> _Held | _Slot:
-        """``x`` times a known factor, kept as a scale and a sign as long as possible."""
+        """``x`` times a factor that does not depend on the state, stored as a scale and a sign."""
         if isinstance(x, _Held):
             return self.combine("mul", x, factor, aval)
         number = factor.number
         if number is not None:
-            if number == 0:  # also of a value that is not finite: the term is absent
+            if number == 0:  # zero even if x is not finite: the term is absent
                 return factor
             if number < 0:
                 x, factor = x._replace(sign=-x.sign), _Held(aval.dtype.type(-number))
@@ -531,12 +541,13 @@ _WORDS = {"add": "add", "sub": "subtract", "mul": "multiply"}
 
 
 def _key_of(x: _Held) -> Any:
-    """Of a number its bits: zeros of either sign are not the same."""
+    """The identity of an array, or the bits of a number: 0.0 and -0.0 are different keys."""
     return id(x.value) if x.number is None else (x.number.dtype, x.number.tobytes())
 
 
 def _operation(eqn) -> Any:
-    """A key by which operations without effects compare equal, operands aside; else None."""
+    """A key that equal operations share, operands not included; None if the operation has effects
+    or its parameters cannot be hashed."""
     key = (eqn.primitive.name, *sorted(eqn.params.items()))
     try:
         hash(key)

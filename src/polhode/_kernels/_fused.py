@@ -1,4 +1,8 @@
-"""Fused kernels: a piece of a program as one compiled unit."""
+"""Fused kernels: parts of a program that XLA's CPU backend compiles as one machine function each.
+
+A fused kernel is called a *unit* in this package, after its primitive. ``README.md`` describes the
+attributes of XLA that make one, and why every operand of a unit must be used.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -29,10 +33,10 @@ _HOLDABLE = frozenset(
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stage
      stop_gradient sub tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
-"""Operations that a unit may contain; functions with others are compiled as usual."""
+"""Operations that a unit can contain; functions with others are compiled as usual."""
 
 _ANALYSING: ContextVar[list[Callable] | None] = ContextVar("analysing", default=None)
-"""Units met so far in a function that is traced for analysis, as plain code; else None."""
+"""While a function is traced for analysis, with its units inlined: the units found; else None."""
 
 
 def kernel(
@@ -40,18 +44,22 @@ def kernel(
 ) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function (a unit) instead of one task per array.
 
-    A step consists of many short loops over the bodies. As separate tasks each costs a dispatch,
-    fusion repeats the work of one in the next, and many functions take longer to compile than one.
-    An attribute of the call requests a single function. It is a hint that changes no value, set on
-    the CPU only and for plain arithmetic only.
+    A step of an integration consists of many short loops over the bodies. If each is a task of its
+    own, each takes the time of a dispatch, XLA repeats the arithmetic of one in the next, and the
+    many functions take longer to compile than one. An attribute of the call requests a single
+    function. It is a hint that does not change values, and is set on the CPU only and for plain
+    arithmetic only.
 
-    Derivatives are those of ``fn``, without units. With ``linearised`` the value and the
-    coefficients of its derivative are a unit, and only the remaining linear map is not; this suits
-    functions without loops of unknown length. With ``repeated`` tangents are one unit and
-    cotangents another, each of which evaluates the function again: only the operands are stored,
-    which is several times as fast, also to compile, where there would be hundreds of coefficients.
-    Sums over many bodies or times are then written as ``spread``. With ``of_units`` the units
-    inside ``fn`` stay units, within the whole, in its derivatives and under ``vmap``.
+    By default, derivatives are those of ``fn`` without a unit.
+
+    - ``linearised``: the value and the coefficients of its derivative are one unit; only the linear
+      map of the tangents is outside. For functions without loops of unknown length.
+    - ``repeated``: tangents are one unit and cotangents another. Each evaluates the function again,
+      so that only the operands are stored. Where the derivative has hundreds of coefficients, this
+      is several times as fast, to compile as well. ``fn`` has to write its broadcasts over many
+      bodies or times as ``spread``.
+    - ``of_units``: units inside ``fn`` stay units within the outer one, in its derivatives and
+      under ``vmap``.
     """
 
     linearised = linearised and (_policy.linearises_units() or not of_units)
@@ -64,9 +72,9 @@ def kernel(
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
         if not any(isinstance(leaf, Tracer) for leaf in leaves):
-            return fn(*operands)  # run at once, the mark would reach every call inside as well
-        # Units inside are traced plain, so that ``is_holdable`` sees their operations. With
-        # ``of_units`` they stay units: a derivative, which is not a unit as a whole, keeps them.
+            return fn(*operands)  # outside of jit, calls inside would inherit the attributes
+        # Units inside are inlined, so that ``is_holdable`` sees their operations. With ``of_units``
+        # they stay units, and remain so in a derivative, which is not one unit as a whole.
         inner: list[Callable] = []
         analysing = _ANALYSING.set(None if of_units else inner)
         try:
@@ -76,7 +84,7 @@ def kernel(
         finally:
             _ANALYSING.reset(analysing)
         if not is_holdable(closed_jaxpr.jaxpr):
-            if not inner:  # what was traced is the program
+            if not inner:  # no units were inlined: the traced program is that of ``fn``
                 return jax.tree.unflatten(
                     jax.tree.structure(shape), jaxpr_as_fun(closed_jaxpr)(*leaves)
                 )
@@ -91,7 +99,7 @@ def kernel(
 
 
 def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
-    """``fn`` traced, with the operations of units inside it in the open."""
+    """The jaxpr of ``fn``, with the units inside it inlined."""
     analysing = _ANALYSING.set([])
     try:
         return jax.make_jaxpr(fn)(*operands)
@@ -101,10 +109,10 @@ def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
 
 @custom_vmap
 def any_of(these: jax.Array) -> jax.Array:
-    """Whether any of these is not zero, under ``vmap`` any of the whole batch.
+    """Whether any entry is not zero, under ``vmap`` in the whole batch.
 
-    A loop with this condition continues for the whole batch. With a condition for each body JAX
-    would select between old and new values of the whole carry in every iteration.
+    As the condition of a ``while_loop`` it is one for the whole batch. With a condition for each
+    body JAX would select between the old and the new carry of each body in every iteration.
     """
     return jnp.sum(jnp.where(these != 0, 1, 0)) > 0
 
@@ -117,7 +125,7 @@ def _any_of_all(size, batched, these):
 
 @custom_vmap
 def most_of(count: jax.Array) -> jax.Array:
-    """``count``, under ``vmap`` the largest of the whole batch, as a bound of a loop for all."""
+    """``count``, under ``vmap`` the largest one of the batch: a loop bound common to all bodies."""
     return count
 
 
@@ -129,17 +137,17 @@ def _most_of_all(size, batched, count):
 
 @jax.custom_jvp
 def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
-    """``rows`` (S, C) with ``values`` (n, C) at ``places`` (n,) in S, the last of equal ones.
+    """``rows`` (S, C) with ``values`` (n, C) written at the row indices ``places`` (n,).
 
-    On the CPU the rows are written one after another, as a unit cannot contain a scatter. It has
-    no reverse-mode derivative.
+    Of equal indices the last one counts. On the CPU the rows are written one after another, since a
+    unit cannot contain a scatter. There is no reverse-mode derivative.
     """
     return _put_each(rows, places, values)
 
 
 @put.defjvp
 def _put_jvp(primals, tangents):
-    """An explicit rule, as the one that JAX derives from the batching rule confuses batch axes."""
+    """An explicit rule: the one that JAX derives from the batching rule confuses batch axes."""
     (rows, places, values), (rows_, _, values_) = primals, tangents
     return put(rows, places, values), put(rows_, places, values_)
 
@@ -153,8 +161,6 @@ def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     if places.size == 0 or not _policy.is_fused():
         return rows.at[places].set(values)
 
-    # A unit cannot hold a scatter. Rows are written one after another in it, so that bodies of a
-    # chunk need not wait for one another at their saved times.
     def write_row(i, rows):
         place = places[i].astype(i.dtype)
         return jax.lax.dynamic_update_slice(rows, values[i][None], (place, jnp.zeros_like(i)))
@@ -164,12 +170,12 @@ def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
 
 @_put_each.def_vmap
 def _put_all(size, batched, *operands):
-    """The rows of a batch, one after another."""
+    """A batch as one array with all its rows."""
     rows, places, values = (
         x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(operands, batched)
     )
     places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
-    # not ``_put``: a batch around this one would turn its places into a scatter
+    # not ``_put``: a second ``vmap`` would turn its updates of slices into a scatter
     flat = _put_each(_flat(rows), places.reshape(-1), _flat(values))
     return flat.reshape(rows.shape), True
 
@@ -179,10 +185,10 @@ def _flat(x: jax.Array) -> jax.Array:
 
 
 def _with_constants_as_operands(closed_jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program with its closed-over values as first operands, which may be differentiated.
+    """The program with its closed-over values as first operands, since they may be differentiated.
 
-    Small constant arrays, such as the table of a rule, stay inside: as operands they would be
-    carried through every loop. Returns the program and these operands."""
+    Small constant arrays, such as the tables of a Runge-Kutta method, stay inside: as operands they
+    would be carried through every loop. Returns the program and these operands."""
     jaxpr, constants = (
         closed_jaxpr.jaxpr,
         list(zip(closed_jaxpr.jaxpr.constvars, closed_jaxpr.consts, strict=True)),
@@ -206,17 +212,17 @@ def _with_constants_as_operands(closed_jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr,
 
 
 def _is_of_use() -> bool:
-    """Whether on the CPU, and XLA does not partition arrays: a unit cannot be partitioned."""
+    """Whether units are used: on a CPU, unless XLA partitions arrays, which it cannot in a unit."""
     if not _policy.is_fused():
         return False
-    # Within ``jax.shard_map`` each device has a program of its own, which XLA no longer divides.
+    # Within ``jax.shard_map`` each device runs a program of its own, which XLA does not partition.
     kinds = jax.sharding.get_abstract_mesh().axis_types
     by_hand = len(kinds) > 0 and all(kind is AxisType.Manual for kind in kinds)
     return by_hand or jax.device_count() == 1
 
 
 def is_holdable(jaxpr: Any, batched: bool = False) -> bool:
-    """Whether a unit can hold this program, which ``vmap`` has made if it is ``batched``."""
+    """Whether a unit can contain this program; ``batched``: it was made by ``vmap``."""
     return not _sums_widely(jaxpr) and all(
         all(
             equation.primitive.name in _HOLDABLE or (batched and _updates_slice(equation))
@@ -228,13 +234,13 @@ def is_holdable(jaxpr: Any, batched: bool = False) -> bool:
 
 
 def _updates_slice(equation: Any) -> bool:
-    """Whether it is the scatter that ``vmap`` makes of a slice's update at one place for all, which
-    XLA turns back into such an update."""
+    """Whether it is the scatter to which ``vmap`` converts an update of a slice at the same index
+    for the whole batch. XLA converts it back, so that a unit can contain it."""
     return equation.primitive.name == "scatter" and equation.invars[1].aval.ndim == 1
 
 
 def _sums_widely(jaxpr: Any) -> bool:
-    """Whether it reduces so many floats that XLA calls a library, which a unit cannot contain."""
+    """Whether a reduction has so many floats that XLA calls a library, which a unit cannot."""
     return any(
         equation.primitive.name.startswith("reduce_")
         and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
@@ -245,7 +251,7 @@ def _sums_widely(jaxpr: Any) -> bool:
 
 
 def _programs(jaxpr: Any) -> Iterator[Any]:
-    """A program and those that its operations hold, such as the bodies of loops."""
+    """A jaxpr and all jaxprs nested in it, such as the bodies of loops."""
     yield jaxpr
     for equation in jaxpr.eqns:
         for value in jax.tree.leaves(
@@ -257,7 +263,7 @@ def _programs(jaxpr: Any) -> Iterator[Any]:
 
 
 def _is_packable(dtype) -> bool:
-    """Numbers and truth values; not random keys, nor tangents of integers."""
+    """Whether arrays are numbers or truth values: neither random keys nor tangents of integers."""
     return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
 
 
@@ -268,10 +274,10 @@ def _unit(
     repeated: bool = False,
     of_units: bool = False,
 ) -> Callable:
-    """``flat``, a function of arrays with a list of results, as one unit, differentiable.
+    """``flat``, a function of arrays with a list of results, as one differentiable unit.
 
-    ``traced``: the same if it is already traced, and the ``exempt_count`` of ``_unit_call``; the
-    others as of ``kernel``.
+    ``traced``: the jaxpr of ``flat`` if it exists already, and the ``exempt_count`` of
+    ``_unit_call``; other arguments as in ``kernel``.
     """
 
     @jax.custom_jvp
@@ -282,7 +288,7 @@ def _unit(
         return _unit_call(closed_jaxpr, leaves, exempt_count, of_units)
 
     def derivative(leaves, tangents):
-        # What has no tangent stays a constant: its derivative is not worked out at all.
+        # Operands without a tangent are constants: derivatives by them are not computed.
         active_places = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
 
         def of_active(operands, values):
@@ -298,12 +304,13 @@ def _unit(
             values, slopes = jax.jvp(lambda *x: of_active(leaves, x), *arguments)
             return _batched_alike(values, leaves), slopes
 
-        # A derivative of the coefficients takes twice as long to compile as one of the formulas.
+        # For second derivatives, ``fn`` is differentiated twice: to differentiate the coefficients
+        # of its linearisation takes twice as long to compile.
         is_higher_order = any(isinstance(x, ad.JVPTracer) for x in leaves)
         if is_higher_order or not linearised:
             return without_units()
-        # ``jax.linearize`` within the unit: values and coefficients leave it as results, and the
-        # linear map alone is left outside, where JAX can transpose it.
+        # ``jax.linearize`` within the unit, which returns values and coefficients. The linear map
+        # is evaluated outside, where JAX can transpose it.
         shape = []
 
         def value_and_coefficients(*leaves):
@@ -315,7 +322,7 @@ def _unit(
             return [*value, *coefficients, jnp.zeros((), jnp.float32)]
 
         linearisation = jax.make_jaxpr(value_and_coefficients)(*leaves)
-        if not is_holdable(linearisation.jaxpr):  # a rule may hold what the value does not, a sort
+        if not is_holdable(linearisation.jaxpr):  # a custom rule may contain, for example, a sort
             return without_units()
         tree, count = shape
         exempt_count = len(linearisation.out_avals) - 1 - count
@@ -323,7 +330,7 @@ def _unit(
             jaxpr_as_fun(linearisation), False, (linearisation, exempt_count), of_units=of_units
         )
         *results, zero = of_all(*leaves)
-        # Not marked: transposed, it would carry operands that go unused.
+        # Not a unit: its transpose would have operands that are not used.
         linear_map = jax.tree.unflatten(tree, results[count:])
         return results[:count], linear_map(
             *(_on_condition(zero, tangents[k]) for k in active_places)
@@ -334,10 +341,11 @@ def _unit(
 
 
 def _batched_alike(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[jax.Array]:
-    """``results``, each with the batch axes of every one of ``leaves``.
+    """``results``, each with the batch axes of all ``leaves``.
 
-    Under ``vmap`` all results of a unit are batched, also those that depend on no batched operand,
-    and JAX requires the same of the values that a custom derivative returns."""
+    Under ``vmap`` all results of a unit are batched, even those that depend on no batched operand.
+    JAX requires the same batch axes of the values that a custom derivative returns. Here every
+    result is selected by a condition that reads all leaves."""
     firsts = [x[(0,) * x.ndim] for x in map(jnp.asarray, leaves) if x.size]
     always_true = reduce(jnp.logical_or, (x == x for x in firsts), True)
     return [jax.lax.select(jnp.broadcast_to(always_true, x.shape), x, x) for x in results]
@@ -346,7 +354,11 @@ def _batched_alike(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[
 def _of_units(
     of_active: Callable, active_places: Sequence[int], leaves, tangents, like
 ) -> list[Any]:
-    """Tangents of ``of_active``: one unit for the linear map and another for its transpose."""
+    """Tangents of ``of_active``: the linear map is one unit and its transpose another.
+
+    Either is computed from the operands alone. This evaluates the function once more, and avoids
+    storing and reading hundreds of coefficients. ``like``: arrays with the dtypes of the results.
+    """
     count = len(leaves)
     floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
 
@@ -360,7 +372,7 @@ def _of_units(
 
     def against(*arrays):
         leaves, slopes = arrays[:count], list(arrays[count:])
-        # ``jax.vjp`` would take half as long again to trace.
+        # ``jax.vjp`` would take 1.5 times as long to trace.
         back = jax.linear_transpose(
             lambda *d: slope(leaves, d), *(leaves[k] for k in active_places)
         )
@@ -372,8 +384,6 @@ def _of_units(
     def backward(constants, slopes):
         return _unit(against, False, repeated=True)(*constants, *slopes)
 
-    # Tangents and cotangents are a map and its transpose, each computed from the operands alone. It
-    # costs the motion once more, and saves hundreds of coefficients that would be stored and read.
     changes = [tangents[k] for k in active_places]
     by_place = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
     float0_tangents = {
@@ -383,7 +393,8 @@ def _of_units(
 
 
 def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
-    """The tangent, selected on the condition that ``zero`` is 0, which it always is."""
+    """The tangent, selected on the condition that ``zero`` is 0, which is always true: it makes
+    ``zero`` a used result of its unit."""
     if tangent.dtype == jax.dtypes.float0:
         return tangent
     always_true = jnp.broadcast_to(zero == 0, tangent.shape)
@@ -393,13 +404,14 @@ def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
 def _unit_call(
     closed_jaxpr: ClosedJaxpr, arguments: Sequence[Any], exempt_count: int, of_units: bool
 ) -> list[jax.Array]:
-    """The call of a unit, in which every operand is certainly used.
+    """The call of a unit, made such that every operand is used.
 
     XLA ends the process if an operand of such a call is unused, and it removes uses that it can
-    simplify. An additional operand therefore holds two zeros that XLA cannot know: every result is
-    selected on the condition that the first one is zero or any operand begins with another number.
-    The ``exempt_count`` results before the last are exempt, since the selection would copy each in
-    a loop of its own; they are used only together with the last result, which is selected.
+    simplify. An additional operand therefore contains two zeros whose values XLA cannot know. Every
+    result is selected on the condition that the first zero is zero or that any operand has a first
+    entry other than zero. The ``exempt_count`` results before the last one are exempt, since the
+    selection would copy each of them in a loop of its own; they are used only together with the
+    last result, which is selected.
     """
     jaxpr, is_used = partial_eval.dce_jaxpr(
         closed_jaxpr.jaxpr, [True] * len(closed_jaxpr.out_avals)
@@ -409,22 +421,21 @@ def _unit_call(
     if not operands:
         return jaxpr_as_fun(closed_jaxpr)(*arguments)
     empty_arrays = {k: (x.shape, x.dtype) for k, x in enumerate(arrays) if not x.size}
-    # Behind a barrier, for XLA moves constants into what is called. Operands packed into one array
-    # for each dtype were tried: they need the same condition and are copied, and the gradient of a
-    # torqued body took 25 % longer to compile.
+    # behind a barrier: XLA would move constants into the called function
     zeros, *operands = jax.lax.optimization_barrier([jnp.zeros(2, jnp.float32), *operands])
 
     def program(zeros, *operands):
-        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
+        # the attributes belong to the call of the unit, not to calls inside it
+        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
             all_operands = list(operands)
             for k, (shape, dtype) in empty_arrays.items():
                 all_operands.insert(k, jnp.zeros(shape, dtype))
             results = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed_jaxpr.consts))(*all_operands)
-            # one number of each operand is read, whatever XLA folds away of the program itself
+            # the first entry of each operand is read, even if XLA folds all its uses in the program
             firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
             always_true = reduce(jnp.logical_or, firsts, zeros[0] == 0)
-            # through a division, which XLA does not repeat: asked again for each result, the
-            # condition was a quarter of the program
+            # XLA does not repeat a division; without it, it evaluated the condition again for each
+            # result, which made up a quarter of the program
             always_true = jnp.where(always_true, 1, 0) / (1 - zeros[1]) > 0
             conditional = {*range(len(results) - 1 - exempt_count), len(results) - 1}
             alternatives = {
@@ -440,8 +451,9 @@ def _unit_call(
     return _unit_p.bind(zeros, *operands, program=program, shapes=shapes, of_units=of_units)
 
 
-# A primitive, or the derivative of a loop around the call would take the constants in it for known
-# beforehand and hand them in as operands, which might go unused.
+# A primitive hides the program of the unit from partial evaluation. Otherwise the derivative of a
+# loop around the call would move constants out of the unit and pass them as operands, which might
+# not be used.
 _unit_p = Primitive("unit")
 _unit_p.multiple_results = True
 
@@ -464,8 +476,8 @@ def _unit_lowered(*arrays, program, shapes, of_units):
 def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
     """``fn`` over chunks of at most ``size`` of the ``n`` lanes, one after the other.
 
-    Memory stays bounded by a chunk and its arrays stay in the cache. Chunks are of one size; the
-    last is filled up with copies of the last lane, which are dropped again.
+    The memory is limited to that of one chunk, whose arrays stay in the cache. All chunks have the
+    same size; the last one is padded with copies of the last lane, whose results are dropped.
     """
     if n <= size:
         return fn(lanes)
@@ -482,9 +494,11 @@ def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
 
 
 def _unit_batch(arrays, dims, *, program, shapes, of_units):
-    """A unit of a few bodies, and a loop over such units: outside of one the same arithmetic takes
-    a hundred times as long, for XLA repeats what several results need."""
-    if of_units:  # those inside become units of a few bodies
+    """Under ``vmap``: a unit for a small batch, a loop over such units for a larger one.
+
+    Outside of a unit the same arithmetic takes a hundred times as long, because XLA repeats values
+    that several results share."""
+    if of_units:  # the units inside are batched, each by this rule
         out_axes = [0 if x else None for x in _depend_on(program, arrays, dims)]
         return jax.vmap(program, list(dims), out_axes)(*arrays), out_axes
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
@@ -504,7 +518,8 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
         batch = jaxpr_as_fun(closed_jaxpr)
         if _sums_widely(closed_jaxpr.jaxpr):
             return batch(*whole)
-        if not is_holdable(closed_jaxpr.jaxpr, batched=True):  # a slice at a place of each body
+        # where bodies write slices at different indices, ``vmap`` makes a scatter of the writes
+        if not is_holdable(closed_jaxpr.jaxpr, batched=True):
             return jax.lax.map(unit_of_one, lanes)
 
         def batched_program(*arrays):
@@ -519,10 +534,10 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
 
 
 def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | None]) -> list[bool]:
-    """Which results of a program depend on those arrays that have a batch axis.
+    """Which results of a program depend on arrays that have a batch axis.
 
-    What does not, such as times that bodies share, gets none: with times of its own every body
-    would take its own steps backwards."""
+    The others, such as times common to all bodies, get no batch axis: if each body had times of its
+    own, each would take steps of its own in the adjoint integration."""
     lanes = [jnp.shape(x) if d is None else np.delete(x.shape, d) for x, d in zip(arrays, dims)]
     lanes = [jax.ShapeDtypeStruct(tuple(shape), x.dtype) for shape, x in zip(lanes, arrays)]
     jaxpr = jax.make_jaxpr(program)(*lanes).jaxpr
@@ -534,8 +549,10 @@ def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | No
 
 
 def _unit_jvp(arrays, tangents, *, program, **_):
-    """The derivative of a unit, that of its formulas. It is asked for where JAX has traced one
-    derivative without knowing of a second, as in a loop."""
+    """The derivative of a unit is that of its program.
+
+    The custom derivative of ``_unit`` comes first. This rule is used where that derivative has been
+    traced already and JAX differentiates the result once more, as in a loop."""
     at = [k for k, x in enumerate(tangents) if is_slope(x)]
 
     def of_active(*values):

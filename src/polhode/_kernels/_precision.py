@@ -1,8 +1,8 @@
 """Double precision inside a program of single precision.
 
-XLA has double precision whether or not JAX's x64 mode is on. A function that is traced in that mode
-and belongs to a program without it would meet rules of JAX (``vmap``, lowering) that truncate its
-arrays; so it is one operation, traced where it is lowered.
+XLA supports double precision whether or not JAX's x64 mode is on. If a function were traced in that
+mode inside a program without it, rules of JAX (``vmap``, lowering) would truncate its arrays to
+single precision. Here it is one primitive, which is traced in x64 mode when it is lowered.
 """
 
 from collections.abc import Callable
@@ -18,10 +18,10 @@ from jax.interpreters import batching, mlir
 
 
 def in_double(fn: Callable, *single: Any) -> Any:
-    """``fn(*single)``, evaluated in float64, of trees of float32 arrays of one shape.
+    """``fn(*single)`` evaluated in float64, for trees of float32 arrays of one shape.
 
-    ``fn`` is a function of a module, works element by element and returns float32 arrays, truth
-    values or integers. There are no derivatives.
+    ``fn`` is a module-level function (it is hashed), acts on each entry separately and returns
+    float32 arrays, truth values or integers. There are no derivatives.
     """
     leaves, tree = jax.tree.flatten(jax.lax.stop_gradient(single))
     with jax.enable_x64(True):
@@ -35,7 +35,7 @@ _double_p.multiple_results = True
 
 
 def _evaluated(*leaves, fn, tree):
-    # the attributes of the call of a unit are the call's own
+    # the attributes of a unit belong to its call, not to calls inside it
     with jax.enable_x64(True), set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
         doubles = [jax.lax.convert_element_type(x, jnp.float64) for x in leaves]
         return jax.tree.leaves(fn(*jax.tree.unflatten(tree, doubles)))

@@ -43,7 +43,7 @@ class AbstractTurning(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """Floating dtype of the numbers of the frame; that of JAX for functions of time alone."""
+        """Floating dtype of the frame's numbers; JAX's default for functions of time alone."""
         leaves = [x for x in jax.tree.leaves(self) if eqx.is_inexact_array(x)]
         return jnp.result_type(*leaves) if leaves else jnp.result_type(float)
 
@@ -74,18 +74,19 @@ class ConstantRate(AbstractTurning):
 def _turning(
     omega_body: Callable, t: Array, t0: Array, start: Array, wxyz: Array, *hoisted: Array
 ) -> Array:
-    """The attitude ``wxyz`` at ``t``, with the derivatives by ``t`` and by the time ``t0`` of the
-    attitude ``start`` that the angular velocity gives it."""
+    """The attitude ``wxyz`` at ``t``, with analytic derivatives by ``t`` and by the time ``t0`` of
+    the attitude ``start``, from the angular velocity."""
     return wxyz
 
 
 @_turning.defjvp
 def _turning_rule(omega_body, primals, tangents):
-    # Through the steps of an integration they would be zero at its start, where there is no step.
+    # Differentiated through the steps of the integration, they would be zero at t = t0, where there
+    # is no step.
     t, t0, start, _, *hoisted = primals
     value = _turning(omega_body, *primals)
     rate = wxyz_rate(value, omega_body(t, *hoisted))
-    # a later t0 leaves out the rotation that the start would have made until then
+    # a later t0 omits the rotation between the earlier and the later one
     start_rate = wxyz_rate(start, omega_body(t0, *hoisted))
     rate_by_t0 = -multiply(multiply(start_rate, conjugate(start)), value)
     return value, tangents[3] + rate * tangents[0] + rate_by_t0 * tangents[1]
@@ -102,7 +103,7 @@ class VariableRate(AbstractTurning):
         return rate_of_change(self.omega_body, t)
 
     def attitude(self, t):
-        """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
+        """One adaptive integration from ``t0``, with a tolerance of 50 rounding errors per step."""
         if t.weak_type:
             t = t.astype(self.t0.dtype)
         omega_body, hoisted = jax.closure_convert(self.omega_body, t)
@@ -112,7 +113,7 @@ class VariableRate(AbstractTurning):
         return _turning(omega_body, t, t0, self.start, integrated, *hoisted)
 
 
-@eqx.filter_jit  # once for every frame: diffrax would compile its loop at every eager call
+@eqx.filter_jit  # compiled once per frame: outside jit diffrax would compile its loop at every call
 def _integrated(turning: VariableRate, t: Array) -> Array:
     accuracy = 50 * float(jnp.finfo(turning.start.dtype).eps)
     solution = diffrax.diffeqsolve(
@@ -160,14 +161,14 @@ Vector = Float[Array, "*#b 3"]
 
 
 def _at_times(function: Callable, t: Time, dtype: Any):
-    """The function of one time, at every entry of an array of times.
+    """A function of one time, evaluated at every entry of an array of times.
 
-    Lists and integers become floats of ``dtype``.
+    Lists and integers are converted to ``dtype``.
     """
     times = as_float_array("t", t, finite=False)
     if not (isinstance(t, float) or jnp.issubdtype(getattr(t, "dtype", int), jnp.floating)):
         times = times.astype(dtype)
-    if times.size == 0:  # an integration has no empty batches
+    if times.size == 0:  # an integration does not support empty batches
         like = jax.eval_shape(function, jax.ShapeDtypeStruct((), times.dtype))
         return jax.tree.map(lambda x: jnp.zeros((*times.shape, *x.shape), x.dtype), like)
     for _ in range(times.ndim):
@@ -180,7 +181,7 @@ def _cross(left: Array, right: ArrayLike) -> Array:
 
 
 def _aligned(*arrays: Array) -> list[Array]:
-    """Arrays with leading axes of length one, so that all have the same rank."""
+    """The arrays with leading axes of length one added, so that all have the same rank."""
     rank = max(array.ndim for array in arrays)
     return [array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays]
 
@@ -200,8 +201,8 @@ class RotatingFrame(eqx.Module):
 
     Built by `from_rate`, `from_attitude` or `from_trajectory`. Vectors have shape (..., 3), times
     are scalars or arrays that broadcast against the leading axes; "frame" components are along the
-    rotating axes, "space" components along inertial ones. A frame is one frame: for a batch of
-    frames use ``jax.vmap``. What a frame lacks is None and costs nothing: a constant angular
+    rotating axes, "space" components along inertial ones. An object is a single frame: for a batch
+    of frames use ``jax.vmap``. Terms that a frame lacks are not computed: a constant angular
     velocity has no Euler force, an origin at rest no origin force.
 
     ``turning`` gives attitude and rates; ``origin`` is None or a function of time that returns the
@@ -225,8 +226,8 @@ class RotatingFrame(eqx.Module):
     ) -> "RotatingFrame":
         """From an angular velocity along the rotating axes [rad/s]: constant, or a function of t.
 
-        ``wxyz`` is the attitude at ``t0``, axes aligned with space by default. With a function of
-        time the attitude is integrated from ``t0`` at each evaluation.
+        ``wxyz`` is the attitude at ``t0``, by default the identity. With a function of time the
+        attitude is integrated from ``t0`` at each evaluation.
         """
         varies = callable(omega_body)
         omega = None if varies else as_float_array("omega_body", omega_body, (3,))
@@ -254,12 +255,12 @@ class RotatingFrame(eqx.Module):
     ) -> "RotatingFrame":
         """From the attitude as a function of time: a matrix R(t) (3, 3) or a quaternion (4,).
 
-        Angular velocity and angular acceleration come from it by forward-mode differentiation.
+        Angular velocity and acceleration are computed from it by forward-mode differentiation.
         """
         if not callable(attitude):
             raise TypeError(
                 f"attitude must be a function of time, got {type(attitude).__name__}: for a frame"
-                " that turns steadily use RotatingFrame.from_rate."
+                " of constant angular velocity use RotatingFrame.from_rate."
             )
         name = "RotatingFrame.from_attitude"
         takes(name, attitude, ("t",))
@@ -267,11 +268,11 @@ class RotatingFrame(eqx.Module):
         t = jax.ShapeDtypeStruct((), jnp.result_type(float), weak_type=True)
         shapes: list[tuple[int, ...]] = []
 
-        def look(t):
+        def record_shape(t):
             value = attitude(t)
             shapes.append(() if value is None else jnp.shape(value))
 
-        jax.eval_shape(look, t)
+        jax.eval_shape(record_shape, t)
         shape = (3, 3) if shapes == [(3, 3)] else (4,)
         return cls(PrescribedAttitude(Signature(name, {"t": ()}, shape).checked(attitude)), origin)
 
@@ -286,8 +287,8 @@ class RotatingFrame(eqx.Module):
         Attitude, rate and angular acceleration are exact at the samples and interpolated between
         them with errors O(h^6), O(h^5), O(h^4) for samples h apart (`SampledAttitude`). Of a body
         with a ``ph.EnergySink`` the rates are those at which its axes rotate, slip included.
-        Raises ValueError for a batch of bodies, missing records, or samples half a revolution
-        apart.
+        Raises ValueError for a batch of bodies, missing attitudes or rates, or samples half a
+        revolution or more apart.
         """
         wxyz = trajectory.wxyz
         if wxyz.ndim != 2:
@@ -300,22 +301,22 @@ class RotatingFrame(eqx.Module):
             raise ValueError(
                 f"the trajectory has {ts.shape[0]} sample: two at least are needed to interpolate."
             )
-        omega, bend = motion_of_axes(trajectory)
+        omega, acceleration = motion_of_axes(trajectory)
         if is_concrete(ts, omega):
             speed = np.linalg.norm(np.asarray(omega), axis=-1)
             turn = np.abs(np.diff(np.asarray(ts))) * np.maximum(speed[1:], speed[:-1])
             require(
                 np.all(turn < np.pi),
                 f"the body turns by up to {turn.max():.3g} rad between samples; less than pi is"
-                " needed to interpolate: ask for more times in ph.simulate.",
+                " needed to interpolate: pass more times to ph.simulate.",
             )
-        return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, bend)), origin)
+        return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, acceleration)), origin)
 
     # --- the frame itself -------------------------------------------------------------------------
 
     @property
     def is_uniform(self) -> bool:
-        """Whether the angular velocity is constant (static): there is no Euler force then."""
+        """Whether the angular velocity is constant (static), so that there is no Euler force."""
         return isinstance(self.turning, ConstantRate)
 
     def attitude(self, t: Time) -> Float[Array, "*b 4"]:
@@ -327,7 +328,7 @@ class RotatingFrame(eqx.Module):
         return self._rates(t)[0]
 
     def angular_acceleration(self, t: Time) -> Float[Array, "*b 3"]:
-        """Its derivative in frame components [rad/s^2]."""
+        """Derivative of the angular velocity in frame components [rad/s^2]."""
         omega, slope = self._rates(t)
         return jnp.zeros_like(omega) if slope is None else slope
 
@@ -362,7 +363,7 @@ class RotatingFrame(eqx.Module):
     # --- transformations, both ways (docs/equations.md, 003: 4-19) -----------------------
 
     def position_to_space(self, t: Time, position: Vector, *, wxyz: ArrayLike = None) -> Vector:
-        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
+        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude if known."""
         space_vector = self._rotate_to_space(t, position, wxyz)
         return space_vector if self.origin is None else _sum(space_vector, self._origin(t)[0])
 
@@ -410,7 +411,7 @@ class RotatingFrame(eqx.Module):
     # --- forces by name (docs/equations.md, 003: 20, 21) ---------------------------------
 
     def centrifugal(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
-        """Centrifugal force [N], ``-mass omega x (omega x r)``; zero on the axis."""
+        """Centrifugal force [N], ``-mass omega x (omega x r)``; zero on the rotation axis."""
         omega = self.omega_body(t)
         return _times(mass, -_cross(omega, _cross(omega, position)))
 
@@ -419,14 +420,14 @@ class RotatingFrame(eqx.Module):
         return _times(mass, -2 * _cross(self.omega_body(t), velocity))
 
     def euler(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
-        """Euler force [N], ``-mass d(omega)/dt x r``; plain zeros for a constant rate."""
+        """Euler force [N], ``-mass d(omega)/dt x r``; zero for a constant rate."""
         omega, slope = self._rates(t)
         if slope is None:
             return _no_force(mass, omega, vectors_like(omega, position))
         return _times(mass, -_cross(slope, position))
 
     def origin_force(self, t: Time, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
-        """Force of the accelerating origin [N], ``-mass R^T d2(origin)/dt2``."""
+        """Apparent force of an accelerated origin [N], ``-mass R^T d2(origin)/dt2``."""
         if self.origin is None:
             return _no_force(mass, self.omega_body(t))
         return _times(mass, -self._rotate_to_frame(t, self._origin(t)[2]))
@@ -442,9 +443,9 @@ class RotatingFrame(eqx.Module):
     def apparent_acceleration(
         self, t: Time, position: Vector, velocity: Vector | None = None, *, wxyz: ArrayLike = None
     ) -> Vector:
-        """All apparent forces per unit mass [m/s^2], of a particle at rest without ``velocity``.
+        """Sum of the apparent forces per unit mass [m/s^2]; ``velocity`` None: at rest in it.
 
-        Only the terms that this frame has are computed. ``wxyz``: the attitude, if it is known.
+        Only the terms that this frame has are computed. ``wxyz``: the attitude at ``t``, if known.
         """
         apparent = self._without_origin(t, position, velocity)
         if self.origin is None:
@@ -490,10 +491,10 @@ def accelerometer(
     the lever arm r from the point about which the body rotates. ``gravity_space`` (3,) [m/s^2] is
     for a body that rotates about a point fixed in space; leave it None for a body in free fall,
     where gravity and the acceleration of the mass centre cancel. Leading axes of positions
-    broadcast against the bodies: (n, 3) are n places on one body.
+    broadcast against the bodies: (n, 3) are n positions on one body.
 
     Raises ValueError if the trajectory has no rates (or no attitude where it is needed), or for
-    positions whose leading axes do not fit the bodies.
+    positions whose leading axes do not broadcast against the bodies.
     """
     omega = trajectory.omega_body
     lever = as_float_array("position_body", position_body, (3,)).astype(omega.dtype)

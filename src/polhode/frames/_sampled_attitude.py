@@ -44,7 +44,8 @@ def motion_of_axes(trajectory: Trajectory) -> tuple[Array, Array]:
 
 @jax.jit
 def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
-    """Rotation vector of each interval and its two derivatives by t/h, at start and end."""
+    """Rotation vector of each interval, with its first two derivatives by s = (t - start)/h, at its
+    start and its end: two arrays (t-1, 3, 3)."""
     start, end = slice(None, -1), slice(1, None)
     origin = conjugate(wxyz[start])
     rate = wxyz_rate(wxyz, omega_body)
@@ -69,13 +70,13 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
     return jnp.stack(start_values, axis=1), jnp.stack(end_values, axis=1)
 
 
-@smooth  # the pieces meet with their second derivatives: no step has to end at a sample
+@smooth  # second derivatives are continuous at the samples, so no step has to end there
 def _interval(times: Array, t: Array) -> Array:
     """Index k of the interval from ``times[k]`` to ``times[k + 1]`` that contains ``t``; beyond the
     samples, the nearest one.
 
-    The last time is repeated after an event that ends a simulation: intervals of no width are left
-    out.
+    After an event that ends a simulation the last time is repeated; these intervals of zero width
+    are left out.
     """
     place = jnp.searchsorted(times, t, side="right") - 1
     widths = jnp.sum(times[1:] > times[:-1], dtype=place.dtype)
@@ -83,11 +84,11 @@ def _interval(times: Array, t: Array) -> Array:
 
 
 class SampledAttitude(eqx.Module):
-    """Attitude through samples, with their angular velocities and angular accelerations.
+    """Attitude interpolated through samples with angular velocities and angular accelerations.
 
     Between two samples the rotation vector from the earlier one is the polynomial of degree five
-    that matches attitude, rate and acceleration at both. For samples h apart the attitude is in
-    error by O(h^6), the angular velocity by O(h^5), the angular acceleration by O(h^4); at the
+    that matches attitude, rate and acceleration at both. For samples h apart the error of the
+    attitude is O(h^6), of the angular velocity O(h^5), of the angular acceleration O(h^4); at the
     samples all three are exact. Beyond the samples the nearest polynomial is extrapolated.
     """
 
@@ -99,7 +100,7 @@ class SampledAttitude(eqx.Module):
     def __init__(
         self, ts: ArrayLike, wxyz: ArrayLike, omega_body: ArrayLike, angular_acceleration: ArrayLike
     ):
-        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn from one to the next."""
+        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn between two of them."""
         self.ts = as_float_array("ts", ts, (None,))
         self.wxyz = as_float_array("wxyz", wxyz, (None, 4))
         rates = as_float_array("omega_body", omega_body, (None, 3))
@@ -113,7 +114,8 @@ class SampledAttitude(eqx.Module):
         k = _interval(times, ascending_time)
         s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
         (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
-        # Taylor at the start, and three terms that meet value, slope and bend at the end
+        # Taylor polynomial at the start, plus three terms that match value, first and second
+        # derivative at the end
         value, slope, bend = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
         cubic = 10 * value - 4 * slope + bend / 2
         quartic = -15 * value + 7 * slope - bend
