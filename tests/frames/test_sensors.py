@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import polhode as ph
 from polhode import rotation
@@ -105,6 +106,30 @@ def test_interpolated_attitude_converges_with_sixth_order(tumble):
     orders = np.log2(np.array(errors[0]) / np.array(errors[1]))
     assert errors[1][0] < 1e-7
     np.testing.assert_allclose(orders, [6, 5, 4], atol=0.5)
+
+
+def test_axes_that_slip_are_interpolated_by_the_rates_at_which_they_rotate(tumble):
+    """An energy sink turns the axes in addition to I^-1 L; the motion is SciPy's."""
+    moments, k, times = np.array([1.0, 2.0, 2.5]), 0.3, np.linspace(0.0, 2.0, 161)
+
+    def motion(_, y):
+        momentum, (w, *v) = y[4:], y[:4]
+        axes_rate = momentum / moments + k * np.cross(momentum, momentum / moments)
+        turning = w * axes_rate + np.cross(v, axes_rate)
+        return [-np.dot(v, axes_rate) / 2, *turning / 2, *np.cross(momentum, axes_rate)]
+
+    start = [0.5, 0.5, 0.5, 0.5, 0.4, 2.0, 0.75]
+    y = solve_ivp(motion, (0, 2), start, "DOP853", times, rtol=1e-12, atol=1e-13).y.T
+    wxyz, omega = rotation.normalise(y[:, :4]), jnp.asarray(y[:, 4:] / moments)
+    scene = ph.Scene(ph.Inertia.from_moments(moments), torque=ph.EnergySink(k))
+    samples = jnp.asarray(times[::4]), wxyz[::4], omega[::4]
+    frame = RotatingFrame.from_trajectory(
+        ph.Trajectory(*samples, tumble.status, tumble.steps, scene)
+    )
+    apart = rotation.angle_between(eqx.filter_jit(frame.attitude)(times), wxyz)
+    assert apart.max() < 1e-10
+    slip = k * np.cross(y[8, 4:], omega[8])
+    np.testing.assert_allclose(frame.omega_body(times[8]), omega[8] + slip, rtol=1e-9)
 
 
 def test_a_torqued_body_and_a_batch_of_bodies():

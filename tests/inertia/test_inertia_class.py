@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings, strategies as st
 
-from polhode.inertia import Inertia, MassProperties, Symmetry, physical_margin
+from polhode import GravityGradient, Scene
+from polhode.inertia import (
+    Inertia,
+    MassProperties,
+    Symmetry,
+    inertia_of_second_moments,
+    physical_margin,
+    second_moments,
+)
 from polhode.rotation import normalise
 
 DTYPES = [jnp.float32, jnp.float64]
@@ -171,6 +179,37 @@ def attempt(build):
 
 numbers = st.floats(width=32) | st.integers(-3, 3) | st.none() | st.text(max_size=2)
 garbage = st.recursive(numbers, lambda inner: st.lists(inner, max_size=4), max_leaves=12)
+
+
+TENSOR = [[1.0, 0.1, 0.2], [0.1, 2.0, -0.3], [0.2, -0.3, 2.5]]
+OMEGA, WXYZ = np.array([0.4, 1.0, 0.3]), normalise(jnp.array([0.5, 0.6, 0.1, 0.3]))
+GRADIENT = GravityGradient(1.0, [1.0, 0.5, 0.2])
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        lambda body: jnp.sum(body.momentum(OMEGA) * jnp.array([1.0, 0.3, 2.0])),
+        lambda body: jnp.sum(body.rates(OMEGA) * jnp.array([1.0, 0.3, 2.0])),
+        lambda body: jnp.sum(Scene(body).acceleration(None, jnp.asarray(OMEGA), 0.0) ** 3),
+        lambda body: jnp.sum(Scene(body, GRADIENT).acceleration(WXYZ, jnp.asarray(OMEGA), 0.0)),
+        lambda body: physical_margin(body.full),
+        lambda body: jnp.sum(inertia_of_second_moments(second_moments(body.full) ** 2) ** 2),
+    ],
+    ids=["momentum", "rates", "free", "gravity gradient", "margin", "second moments"],
+)
+def test_a_step_along_a_gradient_keeps_the_tensor_symmetric(value):
+    body = Inertia.from_tensor(TENSOR)
+    gradient = np.asarray(jax.grad(value)(body).full)
+    np.testing.assert_allclose(gradient, gradient.T, atol=1e-14)
+    assert np.abs(gradient[np.triu_indices(3, 1)]).min() > 0
+    for i, j in ((0, 1), (2, 2)):  # a symmetric change, against differences
+        change = np.zeros((3, 3))
+        change[i, j] = change[j, i] = 1e-6
+        ends = (value(Inertia(full=jnp.asarray(TENSOR) + sign * change)) for sign in (1, -1))
+        np.testing.assert_allclose(np.sum(gradient * change), np.subtract(*ends) / 2, rtol=1e-6)
+    after = Inertia(full=body.full - 0.01 * gradient, physical=True)
+    assert bool(after.is_possible)
 
 
 @settings(max_examples=150, deadline=None)

@@ -23,14 +23,7 @@ from polhode._checks import (
 from polhode._hamiltonian import Attitude, Vector, components, cross, dot, triple
 from polhode._parts import AbstractPart, Signature, above_zero, shaped
 from polhode._scene._tables import Table, check_kind
-from polhode._scene._torques import (
-    AbstractTorque,
-    coefficients,
-    stacked,
-    unit,
-    value_at,
-    vector_of_time,
-)
+from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
 from polhode._scene._wheels import AbstractCoupling, AbstractRotor, Rotor, RotorSum
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -74,7 +67,7 @@ class Pointing(AbstractTorque):
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
-        a, *b = unit(jnp.unstack(self.target, axis=-1))
+        a, *b = jnp.unstack(self.target, axis=-1)
         w, *v = attitude.wxyz
         scalar = a * w + b[0] * v[0] + b[1] * v[1] + b[2] * v[2]
         b_cross_v = cross(b, v)
@@ -521,8 +514,7 @@ class ControlMomentGyro(AbstractTorque):
             value = self.angle(t)
         else:
             value = Signature("ControlMomentGyro angle", {"t": ()}).mapped(angle, t)
-        gimbal, spin = unit(components(self.gimbal)), unit(components(self.spin))
-        across = cross(gimbal, spin)
+        spin, across = components(self.spin), cross(components(self.gimbal), components(self.spin))
         c, s = self.momentum * jnp.cos(value), self.momentum * jnp.sin(value)
         return triple(c * a + s * b for a, b in zip(spin, across))
 

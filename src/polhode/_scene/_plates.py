@@ -11,7 +11,7 @@ from polhode._checks import ArrayLike, as_float_array, as_positive, is_concrete,
 from polhode._hamiltonian import Attitude, Vector, cross, dot, triple
 from polhode._parts import AbstractPart, Signature, above_zero, shaped
 from polhode._scene._tables import check_kind
-from polhode._scene._torques import AbstractTorque, unit, value_at, vector_of_time
+from polhode._scene._torques import AbstractTorque, value_at, vector_of_time
 
 
 class Plates(AbstractPart):
@@ -60,7 +60,7 @@ class Plates(AbstractPart):
             normal, centre = (
                 triple(x[..., i, k] for k in range(3)) for x in (self.normal, self.centre)
             )
-            parts.append(cross(centre, force(i, triple(unit(normal)))))
+            parts.append(cross(centre, force(i, normal)))
         return triple(sum(column[1:], start=column[0]) for column in zip(*parts))
 
 
@@ -207,7 +207,9 @@ class SolarPressure(AbstractTorque):
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
-        s = attitude.to_body(unit(value_at("SolarPressure direction", self.direction, t)))
+        s = value_at("SolarPressure direction", self.direction, t)
+        size = jnp.sqrt(dot(s, s))
+        s = attitude.to_body(triple(x / size for x in s))
         pressure = self.pressure * number_at("SolarPressure lit", self.lit, t)
 
         def force(i, normal):

@@ -18,7 +18,7 @@ from polhode._checks import (
     require,
     require_positive,
 )
-from polhode._hamiltonian import Attitude, Vector, components, cross, dot, triple
+from polhode._hamiltonian import Attitude, Vector, components, cross, triple
 from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
 from polhode._scene._tables import check_kind
 
@@ -94,12 +94,6 @@ class TorqueSum(AbstractTorque, AbstractSum):
 def stacked(parts: Sequence[Array]) -> Array:
     """An array (..., n) from its n components, which broadcast together."""
     return jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
-
-
-def unit(vector: Sequence[Array]) -> tuple[Array, ...]:
-    """Components of a vector divided by its length, which a step of an optimiser may change."""
-    size = jnp.sqrt(dot(vector, vector))
-    return tuple(x / size for x in vector)
 
 
 def vector_of_time(name: str, n: Any) -> Array | Callable:

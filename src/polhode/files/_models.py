@@ -66,10 +66,9 @@ class Times(Table):
             if self.stop is None:
                 raise ValueError("stop is missing: add `stop = ...`, or values")
             if (self.number is None) == (self.step is None):
-                keys = "none of them" if self.step is None else "both"
-                raise ValueError(
-                    f"exactly one of number, step is needed, got {keys}: add `number = ...`"
-                )
+                found = "none of them: add `number = ...`"
+                found = found if self.step is None else "both: remove one of them"
+                raise ValueError(f"exactly one of number, step is needed, got {found}")
             ends = [self.first, self.stop]
             span = self.stop - self.first
             if self.step is not None and not 1 <= abs(span / self.step) <= MAX_SAMPLES - 1:

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, batch_of, is_concrete, require, vectors_like
-from polhode._kernels import smooth
 from polhode._parts import Signature, as_static, takes
 from polhode._trajectory import Trajectory
+from polhode.frames._sampled_attitude import SampledAttitude, motion_of_axes
 from polhode.rotation import (
     conjugate,
     identity,
@@ -27,7 +27,6 @@ from polhode.rotation import (
     normalise,
     rotate,
     rotation_vector_to_wxyz,
-    wxyz_to_rotation_vector,
 )
 from polhode.rotation._quaternion import wxyz_rate
 
@@ -155,88 +154,6 @@ class PrescribedAttitude(AbstractTurning):
     def attitude(self, t):
         value = self.function(t)
         return matrix_to_wxyz(value) if value.ndim == 2 else normalise(value)
-
-
-@jax.jit
-def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
-    """Rotation vector of each interval, with its first two derivatives by s = (t - start)/h, at its
-    start and its end: two arrays (t-1, 3, 3)."""
-    start, end = slice(None, -1), slice(1, None)
-    origin = conjugate(wxyz[start])
-    rate = wxyz_rate(wxyz, omega_body)
-    bend = wxyz_rate(rate, omega_body) + wxyz_rate(wxyz, angular_acceleration)
-
-    def vector(h):
-        path = wxyz[end] + h * rate[end] + h * h / 2 * bend[end]
-        return wxyz_to_rotation_vector(multiply(origin, path))
-
-    def slope(h):
-        return jax.jvp(vector, (h,), (jnp.ones_like(h),))[1]
-
-    zero = jnp.zeros((), ts.dtype)
-    first_derivative, second_derivative = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))
-    step = (ts[end] - ts[start])[:, None]
-    start_values = [
-        jnp.zeros_like(first_derivative),
-        step * omega_body[start],
-        step**2 * angular_acceleration[start],
-    ]
-    end_values = [vector(zero), step * first_derivative, step**2 * second_derivative]
-    return jnp.stack(start_values, axis=1), jnp.stack(end_values, axis=1)
-
-
-@smooth  # second derivatives are continuous at the samples, so no step has to end there
-def _interval(times: Array, t: Array) -> Array:
-    """Index k of the interval from ``times[k]`` to ``times[k + 1]`` that contains ``t``; beyond the
-    samples, the nearest one.
-
-    After an event that ends a simulation the last time is repeated; these intervals of zero width
-    are left out.
-    """
-    place = jnp.searchsorted(times, t, side="right") - 1
-    widths = jnp.sum(times[1:] > times[:-1], dtype=place.dtype)
-    return jnp.clip(place, 0, jnp.maximum(widths - 1, 0))
-
-
-class SampledAttitude(eqx.Module):
-    """Attitude interpolated through samples with angular velocities and angular accelerations.
-
-    Between two samples the rotation vector from the earlier one is the polynomial of degree five
-    that matches attitude, rate and acceleration at both. For samples h apart the error of the
-    attitude is O(h^6), of the angular velocity O(h^5), of the angular acceleration O(h^4); at the
-    samples all three are exact. Beyond the samples the nearest polynomial is extrapolated.
-    """
-
-    ts: Float[Array, " t"]
-    wxyz: Float[Array, "t 4"]
-    start_slope: Float[Array, "t-1 3 3"]
-    end_slope: Float[Array, "t-1 3 3"]
-
-    def __init__(
-        self, ts: ArrayLike, wxyz: ArrayLike, omega_body: ArrayLike, angular_acceleration: ArrayLike
-    ):
-        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn between two of them."""
-        self.ts = as_float_array("ts", ts, (None,))
-        self.wxyz = as_float_array("wxyz", wxyz, (None, 4))
-        rates = as_float_array("omega_body", omega_body, (None, 3))
-        acceleration = as_float_array("angular_acceleration", angular_acceleration, (None, 3))
-        slopes = _slopes(self.ts, self.wxyz, rates, acceleration)
-        self.start_slope, self.end_slope = slopes
-
-    def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:
-        backwards = self.ts[-1] < self.ts[0]
-        times, ascending_time = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
-        k = _interval(times, ascending_time)
-        s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
-        (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
-        # Taylor polynomial at the start, plus three terms that match value, first and second
-        # derivative at the end
-        value, slope, bend = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
-        cubic = 10 * value - 4 * slope + bend / 2
-        quartic = -15 * value + 7 * slope - bend
-        quintic = 6 * value - 3 * slope + bend / 2
-        vector = s * (v0 + s * (a0 / 2 + s * (cubic + s * (quartic + s * quintic))))
-        return multiply(self.wxyz[k], rotation_vector_to_wxyz(vector))
 
 
 Time = Float[ArrayLike, "*#b"]
@@ -368,11 +285,12 @@ class RotatingFrame(eqx.Module):
         """The body axes of one simulated body.
 
         Attitude, rate and angular acceleration are exact at the samples and interpolated between
-        them with errors O(h^6), O(h^5), O(h^4) for samples h apart (`SampledAttitude`).
+        them with errors O(h^6), O(h^5), O(h^4) for samples h apart (`SampledAttitude`). Of a body
+        with a ``ph.EnergySink`` the rates are those at which its axes rotate, slip included.
         Raises ValueError for a batch of bodies, missing attitudes or rates, or samples half a
         revolution or more apart.
         """
-        wxyz, omega = trajectory.wxyz, trajectory.omega_body
+        wxyz = trajectory.wxyz
         if wxyz.ndim != 2:
             raise ValueError(
                 f"the trajectory holds a batch of bodies of shape {wxyz.shape[:-2]}: choose one"
@@ -383,6 +301,7 @@ class RotatingFrame(eqx.Module):
             raise ValueError(
                 f"the trajectory has {ts.shape[0]} sample: two at least are needed to interpolate."
             )
+        omega, acceleration = motion_of_axes(trajectory)
         if is_concrete(ts, omega):
             speed = np.linalg.norm(np.asarray(omega), axis=-1)
             turn = np.abs(np.diff(np.asarray(ts))) * np.maximum(speed[1:], speed[:-1])
@@ -391,7 +310,6 @@ class RotatingFrame(eqx.Module):
                 f"the body turns by up to {turn.max():.3g} rad between samples; less than pi is"
                 " needed to interpolate: pass more times to ph.simulate.",
             )
-        acceleration = angular_acceleration(trajectory)
         return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, acceleration)), origin)
 
     # --- the frame itself -------------------------------------------------------------------------

@@ -37,6 +37,7 @@ from polhode.inertia._physical import (
     principal_moments,
     rotate_tensor,
     tolerance,
+    with_symmetric_derivatives,
 )
 from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.rotation import wxyz_to_matrix
@@ -57,8 +58,8 @@ class Inertia(AbstractShaped, AbstractPart):
     3), moments about body x, y, z, which are principal axes; ``full`` (..., 3, 3), any axes;
     ``transverse`` (...) and ``axial`` (...) of a body symmetric about body z; ``moment`` (...) of
     one with three equal moments. A symmetry therefore cannot be lost, for example in a step of an
-    optimiser. Numbers passed by these names are not checked until the simulation
-    (``ph.Status.NOT_PHYSICAL``).
+    optimiser; gradients with respect to ``full`` are symmetric. Numbers passed by these names are
+    not checked until the simulation (``ph.Status.NOT_PHYSICAL``).
 
     ``physical`` (static): whether the triangle inequality is required; positive moments and a
     symmetric tensor always are. Default: True for ``moments``, False for numbers passed by name
@@ -258,7 +259,7 @@ class Inertia(AbstractShaped, AbstractPart):
     def tensor(self) -> Float[Array, "*b 3 3"]:
         """The tensor (..., 3, 3) in body axes [kg m^2]."""
         if self.full is not None:
-            return self.full
+            return with_symmetric_derivatives(self.full)
         return _diagonal(self.moments)
 
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
@@ -287,7 +288,7 @@ class Inertia(AbstractShaped, AbstractPart):
         omega = as_vectors("omega", omega)
         if self.full is None:
             return jnp.multiply(*jnp.broadcast_arrays(self.moments, omega))
-        return _product(self.full, omega)
+        return _product(self.tensor, omega)
 
     def rates(self, momentum: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body rates ``I^-1 L``, rad/s, of body momenta (..., 3), kg m^2/s."""
@@ -296,7 +297,7 @@ class Inertia(AbstractShaped, AbstractPart):
             moments, momentum = jnp.broadcast_arrays(self.moments, momentum)
             return momentum / moments
         batch = jnp.broadcast_shapes(self.batch_shape, momentum.shape[:-1])
-        tensor = jnp.broadcast_to(self.full, (*batch, 3, 3))
+        tensor = jnp.broadcast_to(self.tensor, (*batch, 3, 3))
         return _solve(tensor, jnp.broadcast_to(momentum, (*batch, 3)))
 
 

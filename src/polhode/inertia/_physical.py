@@ -158,6 +158,19 @@ def _as_tensors(value: Any, name: str = "tensor") -> Array:
     return as_float_array(name, value, (3, 3), finite=False)
 
 
+@jax.custom_jvp
+def with_symmetric_derivatives(tensor: Array) -> Array:
+    """The tensor. Derivatives by opposite entries are equal, whichever of them a formula uses, so
+    that a step along a gradient keeps the tensor symmetric."""
+    return tensor
+
+
+@with_symmetric_derivatives.defjvp
+def _symmetric_rule(primals, tangents):
+    (tensor,), (change,) = primals, tangents
+    return with_symmetric_derivatives(tensor), (change + jnp.swapaxes(change, -1, -2)) / 2
+
+
 @jax.jit  # outside jit too, one program for its hundred operations
 @kernel  # compiles in half the time
 def _principal(tensor: Array) -> tuple[Array, Array, Array]:
@@ -223,7 +236,7 @@ def symmetric(diagonal, off):
 
 def second_moments(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     """Second moments ``Sigma = tr(I)/2 - I`` (..., 3, 3), kg m^2, of inertia tensors."""
-    tensor = _as_tensors(tensor)
+    tensor = with_symmetric_derivatives(_as_tensors(tensor))
     a, b, c = (tensor[..., i, i] for i in range(3))
     off = (-tensor[..., 1, 2], -tensor[..., 0, 2], -tensor[..., 0, 1])
     return symmetric(((b + c - a) / 2, (c + a - b) / 2, (a + b - c) / 2), off)
@@ -231,7 +244,7 @@ def second_moments(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 3 3"]
 
 def inertia_of_second_moments(sigma: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     """Inertia tensors ``I = tr(Sigma) - Sigma`` (..., 3, 3), kg m^2, of second moments."""
-    sigma = _as_tensors(sigma, "sigma")
+    sigma = with_symmetric_derivatives(_as_tensors(sigma, "sigma"))
     a, b, c = (sigma[..., i, i] for i in range(3))
     off = (-sigma[..., 1, 2], -sigma[..., 0, 2], -sigma[..., 0, 1])
     return symmetric((b + c, c + a, a + b), off)
