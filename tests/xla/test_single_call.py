@@ -284,7 +284,7 @@ def test_tops_at_rest_or_without_weight_are_corrected_body_by_body():
     scene = ph.Scene(SYMMETRIC, ph.UniformGravity.axial(1.0, 0.5))
     state = ph.State(jnp.ones((5, 4)), jnp.ones((5, 3)))
     program = jax.make_jaxpr(lambda s: ph.simulate(scene, s, jnp.array([0.0, 1.0])).wxyz)(state)
-    programs = list(_fused._programs(program.jaxpr))
+    programs = list(_fused._nested_jaxprs(program.jaxpr))
     (cond,) = (e for p in programs for e in p.eqns if e.primitive.name == "cond")
     corrected = [e for b in cond.params["branches"] for e in b.jaxpr.eqns]
     assert [e.params["length"] for e in corrected if e.primitive.name == "scan"] == [5]

@@ -51,14 +51,14 @@ from polhode._closed_forms._lagrange_series import Complex, Series
 from polhode._hamiltonian import components
 from polhode._kernels import (
     any_of,
-    attached,
     derivable_once,
-    is_slope,
+    is_nonzero_tangent,
     kernel,
     map_chunks,
     opaque_ones,
     spread,
     staged,
+    with_derivative_rule,
 )
 from polhode._scene import Scene, UniformGravity, Wheels
 
@@ -344,13 +344,13 @@ def with_weight(
 
     # The changes are zero, and computed only in programs that differentiate by the force.
     def rule(operands, tangents, values):
-        if not is_slope(tangents[0]):
+        if not is_nonzero_tangent(tangents[0]):
             return [jnp.zeros_like(x) for x in values]
         along = jax.jvp(lambda f: _first_order(f, *operands[1:]), operands[:1], tangents[:1])
         return along[1]
 
     operands = [force, transverse, distance, wxyz, omega, axial, elapsed, *motion, applies]
-    changes = attached(rule, operands, [jnp.zeros_like(x) for x in motion])
+    changes = with_derivative_rule(rule, operands, [jnp.zeros_like(x) for x in motion])
     return [x + change for x, change in zip(motion, changes)]
 
 

@@ -14,7 +14,7 @@ from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._events._event import Event, at_least, require_bodies
 from polhode._events._search import Brackets, Looks, entries, first_true, minima_of, searched
-from polhode._kernels import attached_to
+from polhode._kernels import with_derivatives_of
 from polhode._method import Status
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory, moved_through, moved_to, with_initial_spins
@@ -379,5 +379,5 @@ def _differentiable(trajectory: Trajectory, event: Event, times, use, slope, sta
         delay, at_events = event.refined(moved_to(eqx.combine(arrays, static), safe), tolerance)
         return [event.values(at_events)[1], safe + delay, *at_events._samples]
 
-    slope, times, *states = attached_to(refined, (arrays, safe), [slope, safe, *states])
+    slope, times, *states = with_derivatives_of(refined, (arrays, safe), [slope, safe, *states])
     return slope, times, states

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._kernels import attached_to
+from polhode._kernels import with_derivatives_of
 from polhode._parts import Signature
 from polhode._trajectory import Trajectory, shortly_after
 from polhode.rotation._quaternion import wxyz_rate
@@ -86,7 +86,7 @@ class Event(eqx.Module):
             return [delay, *at_events._samples]
 
         values = [jnp.zeros_like(approximate._t), *approximate._samples]
-        delay, *states = attached_to(values_of, (arrays, limit, side), values)
+        delay, *states = with_derivatives_of(values_of, (arrays, limit, side), values)
         at_events = approximate._with_samples(
             approximate._t + delay, states, approximate.status, approximate._steps, None
         )

@@ -19,7 +19,7 @@ from polhode._integrate._extrapolation import Extrapolation
 from polhode._integrate._field import FixedArguments
 from polhode._integrate._flow_derivative import Equations, equations_of
 from polhode._integrate._midpoint import Progress
-from polhode._kernels import along_slopes, attached, kernel
+from polhode._kernels import jvp_of_nonzero, kernel, with_derivative_rule
 
 
 class FlowAdjoint(diffrax.AbstractAdjoint):
@@ -190,6 +190,6 @@ def path_of(equations: Equations, c, y0, t0, times, states):
             _, later = jax.lax.scan(across, start, (starts, times, list(states)))
             return later
 
-        return along_slopes(follow, operands, tangents)
+        return jvp_of_nonzero(follow, operands, tangents)
 
-    return attached(rule, [t0, times, *y0, *c], states)
+    return with_derivative_rule(rule, [t0, times, *y0, *c], states)

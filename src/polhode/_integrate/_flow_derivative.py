@@ -24,7 +24,15 @@ from polhode._integrate._columns import table
 from polhode._integrate._extrapolation import order_for, units_of
 from polhode._integrate._field import REVERSE_ONCE, BoundTerm, uses
 from polhode._integrate._midpoint import Field, Limits, initial_progress, integrate
-from polhode._kernels import Distinct, attached, is_slope, kernel, linear, specialise, zeros
+from polhode._kernels import (
+    Distinct,
+    is_nonzero_tangent,
+    kernel,
+    linear,
+    specialise,
+    with_derivative_rule,
+    zeros,
+)
 
 
 @runtime_checkable
@@ -266,7 +274,7 @@ class Equations:
         return self.costate.at(*self._parts(c)[1:3], t, z)
 
     def follow(self, c, y, t0, t1, horizon, end):
-        return attached(self._end_tangents, [t0, t1, horizon, *y, *c], end)
+        return with_derivative_rule(self._end_tangents, [t0, t1, horizon, *y, *c], end)
 
     def _end_tangents(self, operands, tangents, end):
         """Tangent of the end for tangents of the start, of both times and of the arguments."""
@@ -276,9 +284,9 @@ class Equations:
         dt0, dt1, _ = tangents[:3]
         y, c = inputs[: self.size], inputs[self.size :]
         dy, dc = tangents[3 : 3 + self.size], tangents[3 + self.size :]
-        at = tuple(i for i, x in enumerate(dc) if is_slope(x))
-        dy = [x if is_slope(x) else zeros(x) for x in dy]
-        if is_slope(dt0):
+        at = tuple(i for i, x in enumerate(dc) if is_nonzero_tangent(x))
+        dy = [x if is_nonzero_tangent(x) else zeros(x) for x in dy]
+        if is_nonzero_tangent(dt0):
             dy = [a - dt0 * f for a, f in zip(dy, self.field(c, t0, y))]
         maps = (partial(self._tangent, at), partial(self._cotangent, at))
         primals = [*operands[:3], *y, *end, *c]
@@ -287,7 +295,7 @@ class Equations:
         compiled = partial(kernel, of_units=True) if few else None
         slopes = [*dy, *(dc[i] for i in at)]
         end_tangents = linear(*maps, primals, slopes, end, compiled, REVERSE_ONCE)
-        if is_slope(dt1):
+        if is_nonzero_tangent(dt1):
             end_tangents = [a + dt1 * f for a, f in zip(end_tangents, self.field(c, t1, end))]
         return end_tangents
 

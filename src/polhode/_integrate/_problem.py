@@ -14,7 +14,7 @@ from jaxtyping import Array
 from polhode._integrate._explicit_step import Motion
 from polhode._integrate._switches import STATE, TIME, Switched, switched
 from polhode._integrate._tableau import Tableau
-from polhode._kernels import Distinct, formula, is_holdable, specialise
+from polhode._kernels import Distinct, formula, is_fusible, specialise
 
 Pose = Callable[[Any], tuple[Any, Any]]
 """From the parts of a scene, with the arrays of one body (lane axis of length 1), to the diffrax
@@ -193,7 +193,7 @@ class Problem(NamedTuple):
             self.events,
             jumps if any(jumps) else (),
             tuple(np.flatnonzero(swift).tolist()),
-            is_holdable(field.jaxpr),
+            is_fusible(field.jaxpr),
         )
 
     def _specialised(self) -> "_Specialised":

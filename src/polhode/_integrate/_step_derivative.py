@@ -53,7 +53,15 @@ from polhode._integrate._loop import (
     solve,
 )
 from polhode._integrate._turn import FINISHED, advance, snap_reach, turns_by_itself
-from polhode._kernels import any_of, attached, is_slope, kernel, linear, most_of, zeros
+from polhode._kernels import (
+    any_of,
+    is_nonzero_tangent,
+    kernel,
+    linear,
+    max_over_batch,
+    with_derivative_rule,
+    zeros,
+)
 
 
 def samples(
@@ -100,11 +108,11 @@ def samples(
             order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
             ordered_ts = jnp.take_along_axis(ts, order, axis=1)
             states = jnp.take_along_axis(states, order[..., None], axis=1)
-        at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
-        dy = dy if is_slope(dy) else zeros(dy)
+        at = [i for i, x in enumerate(input_tangents[:size]) if is_nonzero_tangent(x)]
+        dy = dy if is_nonzero_tangent(dy) else zeros(dy)
         # Derivatives by times need no integration: a change of the start time is equivalent to a
         # change of the initial state against the rates, and a sample moves along the rates.
-        if is_slope(dstart):
+        if is_nonzero_tangent(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         recorded, record_tree = jax.tree.flatten(record)
         count = len(operands)
@@ -129,7 +137,7 @@ def samples(
         if order is not None:
             place = jnp.argsort(order, axis=1)[..., None]
             change = [jnp.take_along_axis(change[0], place, axis=1)]
-        if is_slope(dts):
+        if is_nonzero_tangent(dts):
             rate = _rates(motion, rows, jnp.moveaxis(values[0], 0, -1))
             dtimes = each_body(start, dts, y.shape[1])[1]
             change = [change[0] + jnp.moveaxis(dtimes[:, None] * rate, -1, 0)]
@@ -137,7 +145,7 @@ def samples(
 
     others, tree_of_others = jax.tree.flatten(solved._replace(samples=None))
     operands, values = [*arrays, *leaves, y, start, ts], [states, *others]
-    states, *others = attached(rule, operands, values, again if turns else None)
+    states, *others = with_derivative_rule(rule, operands, values, again if turns else None)
     return states, jax.tree.unflatten(tree_of_others, others)
 
 
@@ -326,12 +334,12 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     if record is not None:
         # If all iterations are recorded, integration starts with every body stopped and takes none.
         room = record.notes.elapsed.shape[0]
-        is_complete = most_of(record.turns) <= room
+        is_complete = max_over_batch(record.turns) <= room
         # Under ``vmap``, chunks of bodies may have been integrated one after another, with
         # different numbers of iterations. After its last iteration a chunk does not change.
         recorded_turns = jnp.where(is_complete, record.turns, _NEVER)
         notes = jax.tree.map(lambda x, r: jnp.concatenate([r, x[room:]]), notes, record.notes)
-        count = jnp.where(is_complete, most_of(record.turns), 0)
+        count = jnp.where(is_complete, max_over_batch(record.turns), 0)
         levels = record.last.levels.astype(y.dtype)
         after_all = first_progress._replace(
             **record.last._replace(levels=levels)._asdict(), outcome=record.outcome

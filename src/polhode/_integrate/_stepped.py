@@ -38,7 +38,7 @@ from polhode._integrate._step_derivative import samples, segment_turns
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
 from polhode._integrate._turn import LoopOptions
-from polhode._kernels import Distinct, is_holdable, kernel, map_chunks
+from polhode._kernels import Distinct, is_fusible, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -239,7 +239,7 @@ class AbstractIntegration(AbstractMethod):
         of 64 take 3 times as long for 50 satellites). If a kernel cannot contain the field, such as
         a network with matrix products, more, to amortise the calls."""
         problem = self._problem(scene, state, ts, record, search)
-        fits = is_holdable(problem.closed_jaxpr.jaxpr)
+        fits = is_fusible(problem.closed_jaxpr.jaxpr)
         return _policy.bodies_at_once(_policy.KERNEL_BODIES if fits else _policy.LANES)
 
     def search(
