@@ -124,11 +124,11 @@ COINCIDENT = 1e-6
 """[length of the motion] Switches with roots closer than this may be located at the same time: it
 is ``LOCATED_JUMP`` times the coarsest ``rtol``. Knots of a table are much farther apart."""
 
-MARGIN_TURN = 0.05
+MARGIN_VARIATION = 0.05
 """[factor] Of the largest margin of a switch within a step: smallest change between turning points
 that counts. A margin that falls to zero and returns changes by all of it."""
 
-DEEP_TURN = 0.5
+DEEP_EXTREMUM = 0.5
 """[factor] The same for a single turning point, if it is too large for one step: for a sine, 120
 degrees about an extremum. Without it, 2 of 63 short windows, each a seventh of the period long, in
 which an event function changes its sign, are missed (``tests/test_events.py``)."""
