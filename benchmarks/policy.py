@@ -71,7 +71,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "TOP_CHUNK": ((2**9, 2**12, 2**14), ("Lagrange's tops", "Lagrange's tops, 100 times")),
     "ELEMENTARY_CHUNK": ((2**11, 2**17), ("damped symmetric bodies, 100 times",)),
     "ACCELERATOR_SAMPLES": ((2**13, 2**20), ("free bodies", "Lagrange's tops")),
-    "EVENT_LOOK": ((2, 2**16), ("first event of a body", "first events of bodies")),
+    "EVENT_SAMPLES": ((2, 2**16), ("first event of a body", "first events of bodies")),
     "BRIEF_FIT": ((0, 10**9), ("fits",)),
     "FIT_SAMPLES": ((128, 8192), ("fits",)),
     "SAVE_SAMPLES": ((2**15, 2**22), ("saved function of free bodies", "saved function of tops")),

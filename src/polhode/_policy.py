@@ -172,7 +172,7 @@ ACCELERATOR_SAMPLES = 2**18
 the chunk sizes of a CPU a million free bodies take 4 times as long on an H200, and a million of
 Lagrange's tops 300 times as long; in a single chunk, tops take twice as long in float64."""
 
-EVENT_LOOK = 128
+EVENT_SAMPLES = 128
 """[bodies times samples] Evaluated together in the search for the first event of a closed form, two
 samples of each body at least. With two samples at a time a single body takes three to six times as
 long, because each evaluation computes the constants of the motion. With a whole window at a time
