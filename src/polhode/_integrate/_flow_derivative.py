@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from polhode import _policy
@@ -26,6 +26,7 @@ from polhode._integrate._field import REVERSE_ONCE, BoundTerm, uses
 from polhode._integrate._midpoint import Field, Limits, initial_progress, integrate
 from polhode._kernels import (
     Distinct,
+    dependent_results,
     is_nonzero_tangent,
     kernel,
     linear,
@@ -374,7 +375,7 @@ class Equations:
             coefficients, run, broadcast_shapes, _ = specialise(
                 closed_jaxpr, c, fold=fold, stage=False
             )
-            dependent = _dependent_results(partial(coefficients_of, fold), parameters)
+            dependent = _dependent_floats(partial(coefficients_of, fold), parameters)
             if all(broadcast_shapes[i] == {lane} for i in dependent):
                 break
         loop_coefficients, pullback = jax.vjp(
@@ -497,19 +498,14 @@ def _with_entries(values: Sequence[Any], at: Sequence[int], entries: Sequence[An
     return new
 
 
-def _dependent_results(fn: Callable[..., list[Any]], inputs: list[Any]) -> list[int]:
+def _dependent_floats(fn: Callable[..., list[Any]], inputs: list[Any]) -> list[int]:
     """Which inexact results of ``fn`` depend on its inputs."""
     jaxpr = jax.make_jaxpr(fn)(*inputs).jaxpr
-    dependent_vars = set(jaxpr.invars)
-    for eqn in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in dependent_vars for v in eqn.invars):
-            dependent_vars.update(eqn.outvars)
+    dependent = dependent_results(jaxpr, [True] * len(inputs))
     return [
         i
         for i, v in enumerate(jaxpr.outvars)
-        if not isinstance(v, Literal)
-        and v in dependent_vars
-        and jnp.issubdtype(v.aval.dtype, jnp.inexact)
+        if dependent[i] and jnp.issubdtype(v.aval.dtype, jnp.inexact)
     ]
 
 

@@ -374,8 +374,7 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
         error = error + control.SIXTH_DIFFERENCE * length_of(rule.difference)
     angle = rate * width
     total_angle = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
-    drift_ratio = jnp.maximum(total_angle / control.DRIFT_ANGLE, 1)
-    drift = jnp.sqrt(drift_ratio * jnp.sqrt(drift_ratio))
+    drift = control.drift_divisor(total_angle)
     tolerance = (
         control.EXPLICIT_SHARE * options.rtol.astype(error.dtype) * angle / (total_angle * drift)
     )

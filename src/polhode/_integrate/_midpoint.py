@@ -255,7 +255,7 @@ def integrate(
         fraction = jnp.minimum(carry.total_angle / expected, 1)
         first_share = control.FIRST_SHARE
         share = control.MIDPOINT_SHARE * (first_share + 3 * (1 - first_share) * fraction * fraction)
-        tolerance = share * limits.rtol * angle / (expected * _drift(expected))
+        tolerance = share * limits.rtol * angle / (expected * control.drift_divisor(expected))
         rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
         tolerance = jnp.maximum(tolerance, rounding * eps)
         is_finite = jnp.isfinite(error) & jnp.isfinite(angle)  # a long attempt may overflow
@@ -432,13 +432,6 @@ def integrate(
         integrals,
         Progress(width, total_angle, compensation, *counts, error, elapsed, reason, rows),
     )
-
-
-def _drift(angle: Array) -> Array:
-    """Divisor of the tolerance: the power 3/4 of the angle over ``DRIFT_ANGLE``, by square roots,
-    which are faster than a power."""
-    ratio = jnp.maximum(angle / control.DRIFT_ANGLE, 1)
-    return jnp.sqrt(ratio * jnp.sqrt(ratio))
 
 
 def _select_integrals(accepted, candidates, integrals):

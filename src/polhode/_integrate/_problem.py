@@ -8,13 +8,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
 from polhode._integrate._explicit_step import Motion
 from polhode._integrate._switches import STATE, TIME, SwitchedProgram, switches_of
 from polhode._integrate._tableau import Tableau
-from polhode._kernels import Distinct, formula, is_fusible, specialise
+from polhode._kernels import (
+    Distinct,
+    constants_as_operands,
+    dependent_results,
+    formula,
+    is_fusible,
+    specialise,
+)
 
 TermOf = Callable[[Any], tuple[Any, Any]]
 """From the parts of a scene, with the arrays of one body (lane axis of length 1), to the diffrax
@@ -72,10 +79,11 @@ class Problem(NamedTuple):
         components, state_tree = jax.tree.flatten(y0)
         events = 0
 
-        def equations(t, *operands):
+        def equations(*operands):
             nonlocal events
-            y = jax.tree.unflatten(state_tree, operands[: len(components)])
-            ordered_arrays = iter([operands[len(components) :][i] for i in distinct.places])
+            t, *y = operands[len(distinct_arrays) :]
+            y = jax.tree.unflatten(state_tree, y)
+            ordered_arrays = iter([operands[i] for i in distinct.places])
             values = [
                 (next(ordered_arrays)[None] if x.lane else next(ordered_arrays))
                 if eqx.is_array(x.value)
@@ -95,8 +103,8 @@ class Problem(NamedTuple):
 
         single_lane = [x[0] if lane else x for x, lane in zip(distinct_arrays, flags)]
         dtype = jnp.result_type(*components)
-        closed_jaxpr = formula(equations, t, *(jnp.ravel(x)[:1] for x in components), *single_lane)
-        closed_jaxpr, consts = _with_consts_as_operands(closed_jaxpr, 1 + len(components))
+        closed_jaxpr = formula(equations, *single_lane, t, *(jnp.ravel(x)[:1] for x in components))
+        closed_jaxpr, consts = constants_as_operands(closed_jaxpr)
         varies = [
             *[0] * (len(closed_jaxpr.jaxpr.invars) - 1 - len(components)),
             TIME,
@@ -228,7 +236,7 @@ class Problem(NamedTuple):
             return list(specialised.coefficients)
 
         prepared = jax.make_jaxpr(coefficients_of)(*single_lane)
-        depends = _depends(prepared.jaxpr, self.lanes)
+        depends = dependent_results(prepared.jaxpr, self.lanes)
         kinds = [(is_lane, x.shape, x.dtype) for is_lane, x in zip(depends, prepared.out_avals)]
         return _Specialised(prepared, fields[0], kinds)
 
@@ -279,25 +287,3 @@ class _Stacks:
             for i, part in zip(members, parts, strict=True):
                 arrays[i] = part
         return arrays
-
-
-def _with_consts_as_operands(
-    closed_jaxpr: ClosedJaxpr, variable_count: int
-) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program with its closed-over values as first operands and the first ``variable_count``
-    operands (time and state) as last ones; and the closed-over values."""
-    jaxpr = closed_jaxpr.jaxpr
-    invars = [*jaxpr.constvars, *jaxpr.invars[variable_count:], *jaxpr.invars[:variable_count]]
-    names = jaxpr.debug_info._replace(arg_names=("",) * len(invars))
-    return ClosedJaxpr(jaxpr.replace(constvars=[], invars=invars, debug_info=names), []), list(
-        closed_jaxpr.consts
-    )
-
-
-def _depends(jaxpr, flags: Sequence[bool]) -> list[bool]:
-    """Which results of a program depend on the arguments with a true flag."""
-    dependent_vars = {v for v, flag in zip(jaxpr.invars, flags) if flag}
-    for eqn in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in dependent_vars for v in eqn.invars):
-            dependent_vars.update(eqn.outvars)
-    return [not isinstance(v, Literal) and v in dependent_vars for v in jaxpr.outvars]

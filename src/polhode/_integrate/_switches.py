@@ -18,7 +18,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
-from polhode._kernels import SMOOTH, without_derivatives
+from polhode._kernels import SMOOTH, binder, subjaxprs, without_derivatives
 
 _CALLS = frozenset(
     "jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat2 checkpoint".split()  # noqa: SIM905
@@ -226,22 +226,15 @@ def _may_switch(jaxpr) -> bool:
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
-        if any(_may_switch(subjaxpr) for subjaxpr in _subjaxprs(eqn)):
+        if any(_may_switch(subjaxpr) for subjaxpr in subjaxprs(eqn)):
             return True
     return False
-
-
-def _subjaxprs(eqn):
-    for value in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda v: hasattr(v, "eqns")):
-        subjaxpr = getattr(value, "jaxpr", value)
-        if hasattr(subjaxpr, "eqns"):
-            yield subjaxpr
 
 
 def _calls_back(jaxpr) -> bool:
     """Whether a program calls functions outside of JAX, which may raise or print."""
     return any(
-        eqn.effects or "callback" in eqn.primitive.name or any(map(_calls_back, _subjaxprs(eqn)))
+        eqn.effects or "callback" in eqn.primitive.name or any(map(_calls_back, subjaxprs(eqn)))
         for eqn in jaxpr.eqns
     )
 
@@ -258,7 +251,7 @@ def _is_step(eqn) -> bool:
     # conversions to integers are handled in ``_switch``, and one to bool is equivalent to ``ne``
     if name == "convert_element_type" or name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED:
         return False
-    return any(map(_is_float, eqn.invars)) and not any(True for _ in _subjaxprs(eqn))
+    return any(map(_is_float, eqn.invars)) and not any(True for _ in subjaxprs(eqn))
 
 
 def _to_integer(eqn) -> bool:
@@ -300,12 +293,12 @@ class _Interpreter:
         name, x = eqn.primitive.name, [value for value, _ in operands]
         self.variation = variation = reduce(or_, (m for _, m in operands), 0)
         if variation and name in _CALLS and eqn.params.get("name") != SMOOTH:
-            for subjaxpr in _subjaxprs(eqn):
+            for subjaxpr in subjaxprs(eqn):
                 if _may_switch(subjaxpr):
                     return self._call(eqn, operands)
-        if variation and name == "scan" and any(map(_may_switch, _subjaxprs(eqn))):
+        if variation and name == "scan" and any(map(_may_switch, subjaxprs(eqn))):
             return self._scan(eqn, operands)
-        branches = list(_subjaxprs(eqn)) if variation and name == "cond" else []
+        branches = list(subjaxprs(eqn)) if variation and name == "cond" else []
         # a check (``eqx.error_if``) must be evaluated in its own branch only
         if any(map(_may_switch, branches)) and not any(map(_calls_back, branches)):
             return self._cond(eqn, operands)
@@ -314,7 +307,7 @@ class _Interpreter:
         if (
             variation
             and name in _OPAQUE
-            and (name != "while" or any(map(_may_switch, _subjaxprs(eqn))))
+            and (name != "while" or any(map(_may_switch, subjaxprs(eqn))))
         ):
             self.hidden_operations.append(name)
         first_var = next((v for v in eqn.invars if not isinstance(v, Literal)), None)
@@ -515,9 +508,5 @@ class _Interpreter:
 
 
 def _bind(eqn, x) -> Sequence[Any]:
-    bind_params = eqn.primitive.get_bind_params(eqn.params)
-    funs, params = (
-        bind_params if isinstance(bind_params, tuple) else ((), bind_params)
-    )  # older versions of JAX return functions too
-    out = eqn.primitive.bind(*funs, *x, **params)
+    out = binder(eqn)(*x)
     return out if eqn.primitive.multiple_results else [out]

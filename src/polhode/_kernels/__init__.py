@@ -39,3 +39,9 @@ from polhode._kernels._fused import (
     put as put,
 )
 from polhode._kernels._precision import in_double as in_double
+from polhode._kernels._programs import (
+    binder as binder,
+    constants_as_operands as constants_as_operands,
+    dependent_results as dependent_results,
+    subjaxprs as subjaxprs,
+)

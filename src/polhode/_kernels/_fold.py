@@ -21,6 +21,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
 
 from polhode import _policy
+from polhode._kernels._programs import binder
 
 # Staging: values that XLA computes once, and not again in every loop that uses them.
 
@@ -438,7 +439,7 @@ class _PartialEvaluator:
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        return self.emit(_binder(eqn), operands, avals, outs, _operation(eqn), name)
+        return self.emit(binder(eqn), operands, avals, outs, _operation(eqn), name)
 
     def evaluate_equation(self, eqn, operands) -> list[_Constant]:
         """The results of an equation that does not depend on the state, as numbers if possible."""
@@ -451,11 +452,11 @@ class _PartialEvaluator:
         if single and name in _FOLDS and all(x.number is not None for x in operands):
             return [_Constant(out.dtype.type(_FOLDS[name](*(x.number for x in operands))))]
         if single and name in _ELEMENTWISE and len(eqn.outvars) == 1:
-            return [_Constant(_binder(eqn)(*(jnp.asarray(x.value) for x in operands)))]
+            return [_Constant(binder(eqn)(*(jnp.asarray(x.value) for x in operands)))]
         operand_arrays = [
             jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(operands, eqn.invars)
         ]
-        results = _binder(eqn)(*operand_arrays)
+        results = binder(eqn)(*operand_arrays)
         return [_Constant(x) for x in (results if isinstance(results, list | tuple) else [results])]
 
     def simplify(self, name, operands, aval) -> _Constant | _LoopValue | None:
@@ -570,10 +571,3 @@ def _operation(eqn) -> Any:
     except TypeError:
         return None
     return None if eqn.effects else key
-
-
-def _binder(eqn):
-    parameters = eqn.primitive.get_bind_params(eqn.params)
-    # older versions of JAX return functions too
-    funs, params = parameters if isinstance(parameters, tuple) else ((), parameters)
-    return lambda *operands: eqn.primitive.bind(*funs, *operands, **params)

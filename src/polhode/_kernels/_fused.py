@@ -4,7 +4,7 @@ A fused kernel is called a *unit* in this package, after its primitive. ``README
 attributes of XLA that make one, and why every operand of a unit must be used.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import reduce
 from typing import Any
@@ -16,12 +16,13 @@ from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
 from polhode import _policy
 from polhode._kernels._derivatives import is_nonzero_tangent, linear
+from polhode._kernels._programs import constants_as_operands, dependent_results, nested_jaxprs
 
 _FUSIBLE_OPERATIONS = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
@@ -89,7 +90,7 @@ def kernel(
                     jax.tree.structure(shape), jaxpr_as_fun(closed_jaxpr)(*leaves)
                 )
             return fn(*operands)
-        program, constants = _with_constants_as_operands(closed_jaxpr)
+        program, constants = constants_as_operands(closed_jaxpr, _is_kernel_operand)
         results = _unit(jaxpr_as_fun(program), linearised, (program, 0), repeated, of_units)(
             *constants, *leaves
         )
@@ -184,31 +185,13 @@ def _flat(x: jax.Array) -> jax.Array:
     return x.reshape(-1, x.shape[-1])
 
 
-def _with_constants_as_operands(closed_jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program with its closed-over values as first operands, since they may be differentiated.
+def _is_kernel_operand(constant: Any) -> bool:
+    """Whether a value over which a function closes becomes an operand of its unit: traced values,
+    since they may be differentiated, and large arrays.
 
-    Small constant arrays, such as the tables of a Runge-Kutta method, stay inside: as operands they
-    would be carried through every loop. Returns the program and these operands."""
-    jaxpr, constants = (
-        closed_jaxpr.jaxpr,
-        list(zip(closed_jaxpr.jaxpr.constvars, closed_jaxpr.consts, strict=True)),
-    )
-    tables = [
-        (v, x)
-        for v, x in constants
-        if not isinstance(x, Tracer) and np.size(x) <= _policy.KERNEL_TABLE
-    ]
-    others = [
-        (v, x) for v, x in constants if isinstance(x, Tracer) or np.size(x) > _policy.KERNEL_TABLE
-    ]
-    names = jaxpr.debug_info.arg_names
-    names = None if names is None else ("",) * len(others) + (*names,)
-    jaxpr_of_all = jaxpr.replace(
-        constvars=[v for v, _ in tables],
-        invars=[*(v for v, _ in others), *jaxpr.invars],
-        debug_info=jaxpr.debug_info._replace(arg_names=names),
-    )
-    return ClosedJaxpr(jaxpr_of_all, [x for _, x in tables]), [x for _, x in others]
+    Small arrays, such as the tables of a Runge-Kutta method, stay inside: as operands they would be
+    carried through every loop."""
+    return isinstance(constant, Tracer) or np.size(constant) > _policy.KERNEL_TABLE
 
 
 def _uses_kernels() -> bool:
@@ -229,7 +212,7 @@ def is_fusible(jaxpr: Any, batched: bool = False) -> bool:
             for equation in program.eqns
         )
         and all(_is_numeric(v.aval.dtype) for v in (*program.invars, *program.constvars))
-        for program in _nested_jaxprs(jaxpr)
+        for program in nested_jaxprs(jaxpr)
     )
 
 
@@ -245,21 +228,9 @@ def _has_large_reduction(jaxpr: Any) -> bool:
         equation.primitive.name.startswith("reduce_")
         and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
         and equation.invars[0].aval.size >= _policy.KERNEL_SUM
-        for program in _nested_jaxprs(jaxpr)
+        for program in nested_jaxprs(jaxpr)
         for equation in program.eqns
     )
-
-
-def _nested_jaxprs(jaxpr: Any) -> Iterator[Any]:
-    """A jaxpr and all jaxprs nested in it, such as the bodies of loops."""
-    yield jaxpr
-    for equation in jaxpr.eqns:
-        for value in jax.tree.leaves(
-            list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
-        ):
-            nested = getattr(value, "jaxpr", value)
-            if hasattr(nested, "eqns"):
-                yield from _nested_jaxprs(nested)
 
 
 def _is_numeric(dtype) -> bool:
@@ -501,7 +472,7 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
     Outside of a unit the same arithmetic takes a hundred times as long, because XLA repeats values
     that several results share."""
     if of_units:  # the units inside are batched, each by this rule
-        out_axes = [0 if x else None for x in _depend_on(program, arrays, dims)]
+        out_axes = [0 if x else None for x in _batched_results(program, arrays, dims)]
         return jax.vmap(program, list(dims), out_axes)(*arrays), out_axes
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     places = [k for k, d in enumerate(dims) if d is not None]
@@ -535,7 +506,9 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
     return map_chunks(unit_of, lanes, size, _policy.KERNEL_BATCH), [0] * len(shapes)
 
 
-def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | None]) -> list[bool]:
+def _batched_results(
+    program: Callable, arrays: Sequence[Any], dims: Sequence[int | None]
+) -> list[bool]:
     """Which results of a program depend on arrays that have a batch axis.
 
     The others, such as times common to all bodies, get no batch axis: if each body had times of its
@@ -543,11 +516,7 @@ def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | No
     lanes = [jnp.shape(x) if d is None else np.delete(x.shape, d) for x, d in zip(arrays, dims)]
     lanes = [jax.ShapeDtypeStruct(tuple(shape), x.dtype) for shape, x in zip(lanes, arrays)]
     jaxpr = jax.make_jaxpr(program)(*lanes).jaxpr
-    dependent = {v for v, d in zip(jaxpr.invars, dims) if d is not None}
-    for equation in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in dependent for v in equation.invars):
-            dependent.update(equation.outvars)
-    return [not isinstance(v, Literal) and v in dependent for v in jaxpr.outvars]
+    return dependent_results(jaxpr, [d is not None for d in dims])
 
 
 def _unit_jvp(arrays, tangents, *, program, **_):
