@@ -91,7 +91,7 @@ def kernel(
                 )
             return fn(*operands)
         program, constants = constants_as_operands(closed_jaxpr, _is_kernel_operand)
-        results = _unit(jaxpr_as_fun(program), linearised, (program, 0), repeated, of_units)(
+        results = _unit(jaxpr_as_fun(program), linearised, program, 0, repeated, of_units)(
             *constants, *leaves
         )
         return jax.tree.unflatten(jax.tree.structure(shape), results)
@@ -241,19 +241,20 @@ def _is_numeric(dtype) -> bool:
 def _unit(
     flat: Callable,
     linearised: bool,
-    traced: Any = None,
+    traced: ClosedJaxpr | None = None,
+    exempt_count: int = 0,
     repeated: bool = False,
     of_units: bool = False,
 ) -> Callable:
     """``flat``, a function of arrays with a list of results, as one differentiable unit.
 
-    ``traced``: the jaxpr of ``flat`` if it exists already, and the ``exempt_count`` of
-    ``_unit_call``; other arguments as in ``kernel``.
+    ``traced``: the jaxpr of ``flat`` if it exists already; ``exempt_count``: see ``_unit_call``;
+    other arguments as in ``kernel``.
     """
 
     @jax.custom_jvp
     def unit(*leaves):
-        closed_jaxpr, exempt_count = traced or (jax.make_jaxpr(flat)(*leaves), 0)
+        closed_jaxpr = traced or jax.make_jaxpr(flat)(*leaves)
         if traced is None and not is_fusible(closed_jaxpr.jaxpr):
             return _with_common_batch_axes(jaxpr_as_fun(closed_jaxpr)(*leaves), leaves)
         return _unit_call(closed_jaxpr, leaves, exempt_count, of_units)
@@ -296,9 +297,9 @@ def _unit(
         if not is_fusible(linearisation.jaxpr):  # a custom rule may contain, for example, a sort
             return without_units()
         tree, count = shape
-        exempt_count = len(linearisation.out_avals) - 1 - count
+        coefficient_count = len(linearisation.out_avals) - 1 - count
         of_all = _unit(
-            jaxpr_as_fun(linearisation), False, (linearisation, exempt_count), of_units=of_units
+            jaxpr_as_fun(linearisation), False, linearisation, coefficient_count, of_units=of_units
         )
         *results, zero = of_all(*leaves)
         # Not a unit: its transpose would have operands that are not used.
