@@ -26,6 +26,7 @@ from polhode._integrate._field import REVERSE_ONCE, BoundTerm, uses
 from polhode._integrate._midpoint import Field, Limits, initial_progress, integrate
 from polhode._kernels import (
     Distinct,
+    Specialised,
     dependent_results,
     is_nonzero_tangent,
     kernel,
@@ -358,66 +359,15 @@ class Equations:
             return [*rates, k]
 
         closed_jaxpr = jax.make_jaxpr(rates_and_pairing)(*c, span[0], *z)
-
-        def coefficients_of(fold, *parameters):
-            return list(
-                specialise(
-                    closed_jaxpr, _with_entries(c, at, parameters), fold=fold, stage=False
-                ).coefficients
-            )
-
-        # Each coefficient of the loop that depends on differentiated inputs takes one more
-        # integral. Folding replaces parameters by their products, which are more numerous; the
-        # field is therefore first specialised without arithmetic. It is folded only if some of the
-        # coefficients then do not have the shape of the lanes.
-        parameters, lane = [c[i] for i in at], end[0].shape
-        for fold in (False, True):
-            coefficients, run, broadcast_shapes, _ = specialise(
-                closed_jaxpr, c, fold=fold, stage=False
-            )
-            dependent = _dependent_floats(partial(coefficients_of, fold), parameters)
-            if all(broadcast_shapes[i] == {lane} for i in dependent):
-                break
-        loop_coefficients, pullback = jax.vjp(
-            lambda *parameters: [coefficients_of(fold, *parameters)[i] for i in dependent],
-            *parameters,
-        )
-        del loop_coefficients
-        # a coefficient common to all bodies has a cotangent for each body, so that the loop
-        # contains no sum
-        is_lane = [broadcast_shapes[i] == {lane} for i in dependent]
-        shapes = [
-            lane if of_lane else jnp.shape(coefficients[i])
-            for i, of_lane in zip(dependent, is_lane)
+        adjoint = _specialised_adjoint(closed_jaxpr, c, at, end[0].shape)
+        mu = [
+            jnp.zeros(s, adjoint.coefficients[i].dtype)
+            for i, s in zip(adjoint.dependent, adjoint.shapes)
         ]
-        mu = [jnp.zeros(s, coefficients[i].dtype) for i, s in zip(dependent, shapes)]
-
-        def adjoint(*leaves, with_integrands=True):
-            loop_values, (t, *z) = leaves[: len(coefficients)], leaves[len(coefficients) :]
-
-            def pairing(*parameters):
-                *rates, k = run(_with_entries(loop_values, dependent, parameters), t, *z)
-                return jnp.sum(k), rates
-
-            broadcast_parameters = [
-                jnp.broadcast_to(loop_values[i], s) for i, s in zip(dependent, shapes)
-            ]
-            if not with_integrands or not dependent:
-                return pairing(*broadcast_parameters)[1]
-            argnums = tuple(range(len(dependent)))
-            integrands, rates = jax.grad(pairing, argnums=argnums, has_aux=True)(
-                *broadcast_parameters
-            )
-            return [*rates, *(-x for x in integrands)]
-
         # The midpoint rule needs the integrands at every other point only (`Rates`). A second field
         # without them, for the other points, halves the work of the integrals.
         with_integrals, without_integrals = (
-            specialise(
-                jax.make_jaxpr(partial(adjoint, with_integrands=b))(*coefficients, span[0], *z),
-                coefficients,
-            )
-            for b in (True, False)
+            _adjoint_field(adjoint, span[0], z, with_integrands=b) for b in (True, False)
         )
 
         def rates(loop_coefficients, t, z, with_integrands):
@@ -428,7 +378,7 @@ class Equations:
 
         loop_coefficients, individual_steps = (
             (with_integrals.coefficients, without_integrals.coefficients),
-            all(is_lane),
+            all(adjoint.is_lane),
         )
         by_entry, units = with_integrals.by_entry and without_integrals.by_entry, self.costate.units
         z, mu = self._solve(
@@ -454,11 +404,15 @@ class Equations:
         mu = [
             jnp.where(is_inaccurate if of_lane else jnp.any(is_inaccurate), jnp.nan, m)
             + (zero_or_nan if of_lane else jnp.sum(zero_or_nan))
-            for m, of_lane in zip(mu, is_lane)
+            for m, of_lane in zip(mu, adjoint.is_lane)
         ]
-        mu = [_summed(m, jnp.shape(coefficients[i])) for m, i in zip(mu, dependent)]
+        coefficients = [adjoint.coefficients[i] for i in adjoint.dependent]
+        mu = [_summed(m, jnp.shape(x)) for m, x in zip(mu, coefficients)]
         start_costate = self.costate.finish(z, start, end, end_costate)
-        return [*(jnp.where(is_finite, x, 0) + zero_or_nan for x in start_costate), *pullback(mu)]
+        return [
+            *(jnp.where(is_finite, x, 0) + zero_or_nan for x in start_costate),
+            *adjoint.pullback(mu),
+        ]
 
     def _solve(
         self,
@@ -489,6 +443,84 @@ class Equations:
             return y, sums
 
         return kernel(run)(coefficients, state_units, rtol, horizon, span, list(y), list(integrals))
+
+
+class _SpecialisedAdjoint(NamedTuple):
+    """Rates of the adjoint equations, and the pairing, after partial evaluation.
+
+    ``coefficients``, ``run``: see ``Specialised``; ``dependent``: indices of the coefficients that
+    depend on differentiated inputs, each of which takes one integral; for each of these
+    ``is_lane``: whether it has an entry for each body, and the shape of the integral in ``shapes``;
+    ``pullback``: from the cotangents of these coefficients to those of the inputs."""
+
+    coefficients: tuple[Any, ...]
+    run: Callable[..., list[Any]]
+    dependent: list[int]
+    is_lane: list[bool]
+    shapes: list[tuple[int, ...]]
+    pullback: Callable[..., Any]
+
+
+def _specialised_adjoint(
+    closed_jaxpr: ClosedJaxpr, c: Sequence[Any], at: Sequence[int], lane: tuple[int, ...]
+) -> _SpecialisedAdjoint:
+    """``closed_jaxpr``: rates and pairing as a function of ``c``, the time and the variables;
+    ``c[i]``, i in ``at``: the differentiated inputs; ``lane``: shape of the components."""
+
+    def coefficients_of(fold, *parameters):
+        return list(
+            specialise(
+                closed_jaxpr, _with_entries(c, at, parameters), fold=fold, stage=False
+            ).coefficients
+        )
+
+    # Each coefficient of the loop that depends on differentiated inputs takes one more integral.
+    # Folding replaces parameters by their products, which are more numerous; the field is therefore
+    # first specialised without arithmetic. It is folded only if some of the coefficients then do
+    # not have the shape of the lanes.
+    parameters = [c[i] for i in at]
+    for fold in (False, True):
+        coefficients, run, broadcast_shapes, _ = specialise(closed_jaxpr, c, fold=fold, stage=False)
+        dependent = _dependent_floats(partial(coefficients_of, fold), parameters)
+        if all(broadcast_shapes[i] == {lane} for i in dependent):
+            break
+    _, pullback = jax.vjp(
+        lambda *parameters: [coefficients_of(fold, *parameters)[i] for i in dependent],
+        *parameters,
+    )
+    # a coefficient common to all bodies has a cotangent for each body, so that the loop contains no
+    # sum
+    is_lane = [broadcast_shapes[i] == {lane} for i in dependent]
+    shapes = [
+        lane if of_lane else jnp.shape(coefficients[i]) for i, of_lane in zip(dependent, is_lane)
+    ]
+    return _SpecialisedAdjoint(coefficients, run, dependent, is_lane, shapes, pullback)
+
+
+def _adjoint_field(
+    adjoint: _SpecialisedAdjoint, t: Array, z: Sequence[Any], with_integrands: bool
+) -> Specialised:
+    """Rates of the variables ``z`` and, if ``with_integrands``, the integrands of the cotangents of
+    the dependent coefficients."""
+    coefficients, run, dependent, _, shapes, _ = adjoint
+
+    def rates_and_integrands(*leaves):
+        loop_values, (t, *z) = leaves[: len(coefficients)], leaves[len(coefficients) :]
+
+        def pairing(*parameters):
+            *rates, k = run(_with_entries(loop_values, dependent, parameters), t, *z)
+            return jnp.sum(k), rates
+
+        broadcast_parameters = [
+            jnp.broadcast_to(loop_values[i], s) for i, s in zip(dependent, shapes)
+        ]
+        if not with_integrands or not dependent:
+            return pairing(*broadcast_parameters)[1]
+        argnums = tuple(range(len(dependent)))
+        integrands, rates = jax.grad(pairing, argnums=argnums, has_aux=True)(*broadcast_parameters)
+        return [*rates, *(-x for x in integrands)]
+
+    return specialise(jax.make_jaxpr(rates_and_integrands)(*coefficients, t, *z), coefficients)
 
 
 def _with_entries(values: Sequence[Any], at: Sequence[int], entries: Sequence[Any]) -> list[Any]:

@@ -247,19 +247,13 @@ def _conclude(
         place=place,
     )
     if switch is not None and undefined is not None and trial.wrong_levels is not None:
-        progress_after, storage = _apply_switch(
-            motion,
-            options,
-            progress,
-            progress_after,
-            storage,
-            attempt,
-            switch,
-            trial.wrong_levels,
-            accepted,
-            width,
-            start,
+        progress_after, flips = _flip_switches(
+            motion, progress, progress_after, trial, switch, trial.wrong_levels
         )
+        if motion.events:
+            progress_after, storage = _store_events(
+                motion, options, start, progress, progress_after, storage, trial, switch, flips
+            )
         if options.differentiable and motion.jumps:
             y = _with_coincident_switch(
                 motion, progress, progress_after, attempt.stages[0], trial.wrong_levels, ts, start
@@ -432,20 +426,17 @@ def _save(
     return storage._replace(samples=samples), place
 
 
-def _apply_switch(
-    motion,
-    options,
-    progress,
-    progress_after,
-    storage,
-    attempt,
+def _flip_switches(
+    motion: Motion,
+    progress: Progress,
+    progress_after: Progress,
+    trial: _Trial,
     switch: SwitchPoint,
-    wrong_levels,
-    accepted,
-    width,
-    start,
-):
-    """Flip the switches at which the step ends, correct wrong levels, and store events."""
+    wrong_levels: Array,
+) -> tuple[Progress, Array]:
+    """Flip the switches at which the step ends, and correct wrong levels. Also returns which
+    switches (K, B) flip."""
+    attempt, accepted = trial.attempt, trial.accepted
     hit = switch.hit & accepted
     flips = switch.flips & hit[None]
     # the step was rejected if levels were wrong at its start; it is repeated with correct levels
@@ -477,21 +468,36 @@ def _apply_switch(
         just_flipped=just_flipped.astype(progress.just_flipped.dtype),
         needs_rates=hit | is_corrected,
         width=jnp.where(
-            is_corrected, progress.width, jnp.where(is_reversal, width / 4, progress_after.width)
+            is_corrected,
+            progress.width,
+            jnp.where(is_reversal, trial.width / 4, progress_after.width),
         ),
         reversals=jnp.where(
             is_reversal, progress.reversals + 1, jnp.where(accepted & ~hit, 0, progress.reversals)
         ),
     )
-    if not motion.events:
-        return progress_after, storage
+    return progress_after, flips
+
+
+def _store_events(
+    motion: Motion,
+    options: LoopOptions,
+    start: Array,
+    progress: Progress,
+    progress_after: Progress,
+    storage: Storage,
+    trial: _Trial,
+    switch: SwitchPoint,
+    flips: Array,
+) -> tuple[Progress, Storage]:
+    """Store the events among the switches ``flips`` (K, B), and stop bodies at terminal ones."""
+    attempt, width = trial.attempt, trial.width
     bodies, capacity = width.shape[0], options.capacity
     sign = jnp.where(attempt.h < 0, -1, 1)
     base = (capacity + 1) * jnp.arange(bodies, dtype=progress_after.count.dtype)
-    count, has_terminal_event = progress_after.count, jnp.zeros_like(hit)
-    is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(
-        width
-    )  # an event at the start is not one of the motion
+    count, has_terminal_event = progress_after.count, jnp.zeros_like(trial.accepted)
+    # an event at the start is not one of the motion
+    is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(width)
     # If two event functions vanish at the same time, the second one is located at the start of the
     # next step. By rounding of its margin it may then flip back and forth; these are not events.
     latest_time = jnp.maximum(jnp.maximum(jnp.abs(start), progress.elapsed), jnp.abs(attempt.h))

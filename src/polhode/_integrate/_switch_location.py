@@ -1,5 +1,6 @@
 """Location of the first switch of the field, or of the first event, within a step."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -69,8 +70,101 @@ def first_switch(
     traced_constants = motion.coefficients, progress, attempt, t
     stopped_constants = jax.lax.stop_gradient(traced_constants)
     _, progress, attempt, t = stopped_constants
-    nodes = motion.rule.margin_nodes
-    sampled = margin_samples(attempt.margins, motion.rule)
+    stages = _stage_margins(motion.rule, attempt, accepted)
+    tolerance, time_spacing = _tolerance(motion, options, progress, attempt, t, eps)
+
+    def margins_at(x, constants=stopped_constants):
+        coefficients, progress, attempt, t = constants
+        y = dense_state(progress.y, attempt.dense, x)
+        _, margins, new_levels = motion.rates(coefficients, progress.levels, t + x * attempt.h, y)
+        return margins, new_levels
+
+    zero_counts = jnp.zeros(attempt.h.shape, jnp.int32)
+    search = _RootSearch(
+        jnp.where(stages.has_minimum, MINIMUM, stages.mode),
+        stages.low,
+        stages.high,
+        stages.at_low,
+        stages.at_high,
+        progress.levels if motion.jumps else None,
+        zero_counts,
+        stages.triple,
+        stages.values,
+        zero_counts,
+        jnp.zeros_like(accepted),
+    )
+    search = jax.lax.while_loop(
+        lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)),
+        partial(_next_search, stages, tolerance, margins_at),
+        search,
+    )
+    # halved margins keep their signs
+    flips = first_of_jumps(motion, search.at_high < 0)
+    fraction = search.high
+    if options.differentiable:
+        margins = partial(margins_at, constants=traced_constants)
+        fraction = _differentiable_fraction(search.hit, flips, fraction, margins)
+    is_lost = search.hit & ~jnp.any(flips, axis=0)
+    start_fraction = jnp.maximum(1e-3, 16 * eps * time_spacing)
+    # kinks and events have the levels 0 and 1
+    levels = 1 - progress.levels if search.new_levels is None else search.new_levels
+    return SwitchPoint(search.hit & ~is_lost, fraction, levels, flips, start_fraction)
+
+
+DONE, ROOT, UPPER_END, MINIMUM, FIRST = range(5)
+"""Next action of the search in a step. DONE: nothing. ROOT: close the bracket between ``low`` and
+``high``, whose margin at ``high`` is negative. UPPER_END: check whether it is. MINIMUM: approach a
+minimum. FIRST: evaluate the secant's root before ``high`` has been checked."""
+
+
+class _RootSearch(NamedTuple):
+    """Carry of the search. ``mode``: see ``DONE``; ``at_low``, ``at_high`` (K, B): margins at the
+    ends of the bracket; ``side`` (B,): which end moved last; ``triple``, ``values``: three points
+    around a minimum and the lowest margin at each; ``count`` of evaluations."""
+
+    mode: Array
+    low: Array
+    high: Array
+    at_low: Array
+    at_high: Array
+    new_levels: Array | None
+    side: Array
+    triple: tuple[Array, ...]
+    values: tuple[Array, ...]
+    count: Array
+    hit: Array
+
+
+class _StageMargins(NamedTuple):
+    """The start of a search, from the margins at the stages.
+
+    ``mode``, ``low``, ``high``, ``at_low``, ``at_high``: the bracket before the first stage with a
+    negative margin, as in ``_RootSearch``; ``has_minimum`` (B,): whether a minimum before it is
+    close to zero; ``triple``, ``values``: three points around that minimum and the lowest margin at
+    each, of the switches ``minimum_switches`` (K, B); ``minimum_start`` (K, B): margins at the
+    first of the three points; ``end_margins`` (K, B): at the end of the step."""
+
+    mode: Array
+    low: Array
+    high: Array
+    at_low: Array
+    at_high: Array
+    has_minimum: Array
+    triple: tuple[Array, ...]
+    values: tuple[Array, ...]
+    minimum_switches: Array
+    minimum_start: Array
+    end_margins: Array
+
+    def lowest(self, margins: Array) -> Array:
+        """The lowest of ``margins`` (K, B) of the switches that have the minimum."""
+        return jnp.min(jnp.where(self.minimum_switches, margins, jnp.inf), axis=0)
+
+
+def _stage_margins(rule: Tableau, attempt: Attempt, accepted: Array) -> _StageMargins:
+    """Bracket and minimum from which the search starts."""
+    nodes = rule.margin_nodes
+    sampled = margin_samples(attempt.margins, rule)
     node_column = jnp.asarray(nodes, sampled.dtype)[:, None]
     size = len(nodes)
     below = jnp.any(sampled < 0, axis=1)  # (L, B)
@@ -97,175 +191,187 @@ def first_switch(
     inner_order = jnp.arange(1, size - 1)[:, None, None]
     depth = jnp.where(inner_order < first_below[None, None], depth, 1)
     min_depth = jnp.min(depth, axis=(0, 1))
-    has_near_minimum = (min_depth <= 0.5) & accepted
-    is_lowest = (depth == min_depth[None, None]) & has_near_minimum[None, None]  # (L - 2, K, B)
+    has_minimum = (min_depth <= 0.5) & accepted
+    is_lowest = (depth == min_depth[None, None]) & has_minimum[None, None]  # (L - 2, K, B)
     lowest_node = jnp.min(jnp.where(jnp.any(is_lowest, axis=1), inner_order[:, 0], size), axis=0)
-    has_lowest = jnp.any(is_lowest & (inner_order == lowest_node[None, None]), axis=0)  # (K, B)
-
-    def lowest(margins):
-        return jnp.min(jnp.where(has_lowest, margins, jnp.inf), axis=0)
-
+    minimum_switches = jnp.any(is_lowest & (inner_order == lowest_node[None, None]), axis=0)
     triple = tuple(entry(node_grid, lowest_node + k) for k in (-1, 0, 1))
     neighbours = [entry(sampled, lowest_node + k) for k in (-1, 0, 1)]
-    values = tuple(lowest(margins) for margins in neighbours)
-    start_margins = jnp.maximum(
-        neighbours[0], 0
-    )  # sufficient for the first secant, although the lower end moves
+    values = tuple(_lowest(minimum_switches, margins) for margins in neighbours)
+    # sufficient for the first secant, although the lower end moves
+    minimum_start = jnp.maximum(neighbours[0], 0)
     has_bracket = accepted & jnp.any(below, axis=0)
     # A negative margin at the last node is that of the state at the end of the step, and is
     # certain. Those at other nodes belong to stages, which are less accurate than dense output.
     is_at_end = has_bracket & (first_below == size - 1)
-    bracket = jnp.where(is_at_end, ROOT, jnp.where(has_bracket, FIRST, DONE))
-    mode = jnp.where(has_near_minimum, MINIMUM, bracket)
-    end_margins = sampled[-1]
-    zero = jnp.zeros_like(attempt.h)
-    # At large times, margins that depend on the time are constant between representable times,
-    # which are ``time_spacing`` eps of the step apart. The search ends beyond the root, so that
-    # switches located to one such interval would all flip late, and jumps of a torque would do
-    # false work.
+    return _StageMargins(
+        jnp.where(is_at_end, ROOT, jnp.where(has_bracket, FIRST, DONE)),
+        low,
+        high,
+        at_low,
+        at_high,
+        has_minimum,
+        triple,
+        values,
+        minimum_switches,
+        minimum_start,
+        sampled[-1],
+    )
+
+
+def _lowest(switches: Array, margins: Array) -> Array:
+    """The lowest of ``margins`` (K, B) of the given ``switches`` (K, B)."""
+    return jnp.min(jnp.where(switches, margins, jnp.inf), axis=0)
+
+
+def _tolerance(
+    motion, options, progress: Progress, attempt: Attempt, t: Array, eps: float
+) -> tuple[Array, Array]:
+    """Width of the bracket within which a switch is located, as a fraction of the step, and the
+    spacing of representable times [eps of the step]."""
+    # At large times, margins that depend on the time are constant between representable times. The
+    # search ends beyond the root, so that switches located to one such interval would all flip
+    # late, and jumps of a torque would do false work.
     latest_time = jnp.maximum(progress.elapsed, jnp.abs(t))
-    time_spacing = latest_time / jnp.where(zero != attempt.h, abs(attempt.h), 1)
+    time_spacing = latest_time / jnp.where(attempt.h != 0, abs(attempt.h), 1)
     tolerance = 4 * eps * jnp.maximum(1, time_spacing / 16)
     if not motion.events:  # events are located to rounding, switches of the rates to ``rtol``
         rtol = options.rtol.astype(tolerance.dtype)
         kink = jnp.minimum(LOCATED_KINK * rtol, LOCATED_ROOT * jnp.sqrt(rtol))
         located = LOCATED_JUMP * rtol if motion.jumps else kink
         tolerance = jnp.maximum(tolerance, located)
+    return tolerance, time_spacing
 
-    def margins_at(x, constants=stopped_constants):
-        coefficients, progress, attempt, t = constants
-        y = dense_state(progress.y, attempt.dense, x)
-        _, margins, new_levels = motion.rates(coefficients, progress.levels, t + x * attempt.h, y)
-        return margins, new_levels
 
-    def root_share(at_low, at_high):
-        """Fraction of the bracket at which the first secant vanishes."""
-        low_margins, falls = jnp.maximum(at_low, 0), at_high < 0
-        share = low_margins / jnp.where(falls, low_margins - at_high, 1)
-        return jnp.min(jnp.where(falls, share, 1), axis=0)
+def _root_share(at_low: Array, at_high: Array) -> Array:
+    """Fraction of the bracket at which the first secant vanishes."""
+    low_margins, falls = jnp.maximum(at_low, 0), at_high < 0
+    share = low_margins / jnp.where(falls, low_margins - at_high, 1)
+    return jnp.min(jnp.where(falls, share, 1), axis=0)
 
-    def secant(search):
-        bracket_width, min_distance = search.high - search.low, tolerance / 2
-        # secants do not converge if margins are zero in a part of the bracket; bisection does
-        halve = (search.count % 8 == 7) | (search.count >= _MAX_SECANTS)
-        share = jnp.where(halve, 0.5, root_share(search.at_low, search.at_high))
-        # points closer than half the tolerance to an end would hardly shorten the bracket
-        x = jnp.maximum(search.low + bracket_width * share, search.low) + min_distance
-        return jnp.minimum(x, search.high - min_distance)
 
-    def iterate(search: _RootSearch) -> _RootSearch:
-        in_minimum, in_upper_end = search.mode == MINIMUM, search.mode == UPPER_END
-        in_first, in_root = search.mode == FIRST, search.mode == ROOT
-        (xa, xb, xc), (fa, fb, fc) = search.triple, search.values
-        vertex, _ = vertex_of(search.triple, search.values)
-        min_distance = 0.05 * (xc - xa)
-        vertex = jnp.clip(vertex, xa + min_distance, xc - min_distance)
-        vertex = jnp.where(
-            jnp.abs(vertex - xb) < 0.2 * min_distance, xb + 0.3 * min_distance, vertex
-        )
-        x = jnp.where(in_minimum, vertex, jnp.where(in_upper_end, search.high, secant(search)))
-        margins, new_levels = margins_at(x)
-        is_negative = jnp.any(margins < 0, axis=0)
-        f = lowest(margins)
+def _secant(search: _RootSearch, tolerance: Array) -> Array:
+    """The next point within a bracket."""
+    bracket_width, min_distance = search.high - search.low, tolerance / 2
+    # secants do not converge if margins are zero in a part of the bracket; bisection does
+    halve = (search.count % 8 == 7) | (search.count >= _MAX_SECANTS)
+    share = jnp.where(halve, 0.5, _root_share(search.at_low, search.at_high))
+    # points closer than half the tolerance to an end would hardly shorten the bracket
+    x = jnp.maximum(search.low + bracket_width * share, search.low) + min_distance
+    return jnp.minimum(x, search.high - min_distance)
 
-        # minimum
-        is_left = vertex < xb
-        is_lower = f < fb
-        ta = jnp.where(is_lower, jnp.where(is_left, xa, xb), jnp.where(is_left, vertex, xa))
-        tb = jnp.where(is_lower, vertex, xb)
-        tc = jnp.where(is_lower, jnp.where(is_left, xb, xc), jnp.where(is_left, xc, vertex))
-        va = jnp.where(is_lower, jnp.where(is_left, fa, fb), jnp.where(is_left, f, fa))
-        vb = jnp.where(is_lower, f, fb)
-        vc = jnp.where(is_lower, jnp.where(is_left, fb, fc), jnp.where(is_left, fc, f))
-        _, min_value = vertex_of((ta, tb, tc), (va, vb, vc))
-        is_exhausted = (min_value > 0.7 * vb) | (search.count > 12)
-        minimum_is_negative = in_minimum & is_negative
-        has_no_root = (
-            in_minimum & ~is_negative & is_exhausted
-        )  # no root here: continue with the bracket of a stage
 
-        # a margin that is negative at a stage may be positive on dense output
-        is_false = in_upper_end & ~is_negative
-        has_later_root = is_false & jnp.any(end_margins < 0, axis=0) & (search.high < 1)
-        retry_mode = jnp.where(search.count < _MAX_POSITIVE_EVALUATIONS, FIRST, UPPER_END)
-        mode = jnp.where(in_first, jnp.where(is_negative, ROOT, retry_mode), search.mode)
-        mode = jnp.where(in_upper_end, jnp.where(is_negative | has_later_root, ROOT, DONE), mode)
-        mode = jnp.where(minimum_is_negative, ROOT, jnp.where(has_no_root, bracket, mode))
+def _point_towards_minimum(search: _RootSearch) -> Array:
+    """The next point in the search for a minimum: the vertex of the parabola, but neither close to
+    one of the three points nor beyond them."""
+    xa, xb, xc = search.triple
+    vertex, _ = vertex_of(search.triple, search.values)
+    min_distance = 0.05 * (xc - xa)
+    vertex = jnp.clip(vertex, xa + min_distance, xc - min_distance)
+    return jnp.where(jnp.abs(vertex - xb) < 0.2 * min_distance, xb + 0.3 * min_distance, vertex)
 
-        # between low and high
-        moves_high = (in_root | in_first | in_upper_end | minimum_is_negative) & is_negative
-        moves_low = (in_root | in_first) & ~is_negative
-        same_end_twice = search.side == jnp.where(is_negative, 1, -1)
-        start_low = jnp.where(minimum_is_negative, xa, jnp.where(has_no_root, low, search.low))
-        low_margins = select_bodies(has_no_root, at_low, search.at_low)
-        low_margins = select_bodies(minimum_is_negative, start_margins, low_margins)
-        new_low = jnp.where(moves_low, x, jnp.where(has_later_root, search.high, start_low))
-        new_high = jnp.where(
-            moves_high, x, jnp.where(has_later_root, 1, jnp.where(has_no_root, high, search.high))
-        )
-        factor = jnp.where((in_root | in_first) & same_end_twice, 0.5, 1)
-        new_at_low = select_bodies(
-            moves_low | has_later_root,
-            margins,
-            low_margins * jnp.where(moves_high, factor, 1)[None],
-        )
-        high_margins = select_bodies(
-            has_later_root, end_margins, select_bodies(has_no_root, at_high, search.at_high)
-        )
-        new_at_high = select_bodies(
-            moves_high, margins, high_margins * jnp.where(moves_low, factor, 1)[None]
-        )
-        remaining_width = (new_high - new_low) * (1 - root_share(new_at_low, new_at_high))
-        is_converged = (
-            (mode == ROOT) & (remaining_width <= tolerance) & (moves_high | (in_root & moves_low))
-        )
-        stop = is_converged | (search.count >= _MAX_EVALUATIONS)
-        hit = search.hit | ((mode == ROOT) & stop)
-        starts_bracket = minimum_is_negative | has_no_root
-        return _RootSearch(
-            jnp.where(stop, DONE, mode),
-            new_low,
-            new_high,
-            new_at_low,
-            new_at_high,
-            select_bodies(moves_high, new_levels, search.new_levels) if motion.jumps else None,
-            jnp.where(
-                in_root | in_first,
-                jnp.where(is_negative, 1, -1),
-                jnp.where(starts_bracket, 0, search.side),
-            ),
-            (ta, tb, tc),
-            (va, vb, vc),
-            jnp.where(starts_bracket, 0, search.count + 1),
-            hit,
-        )
 
-    zero_counts = jnp.zeros(zero.shape, jnp.int32)
-    search = _RootSearch(
-        mode,
-        low,
-        high,
-        at_low,
-        at_high,
-        progress.levels if motion.jumps else None,
-        zero_counts,
+def _next_triple(search: _RootSearch, x: Array, f: Array) -> tuple[tuple, tuple, Array]:
+    """Three points closer to a minimum and the values there, after an evaluation ``f`` at ``x``;
+    and the minimum of their parabola."""
+    (xa, xb, xc), (fa, fb, fc) = search.triple, search.values
+    is_left = x < xb
+    is_lower = f < fb
+    ta = jnp.where(is_lower, jnp.where(is_left, xa, xb), jnp.where(is_left, x, xa))
+    tb = jnp.where(is_lower, x, xb)
+    tc = jnp.where(is_lower, jnp.where(is_left, xb, xc), jnp.where(is_left, xc, x))
+    va = jnp.where(is_lower, jnp.where(is_left, fa, fb), jnp.where(is_left, f, fa))
+    vb = jnp.where(is_lower, f, fb)
+    vc = jnp.where(is_lower, jnp.where(is_left, fb, fc), jnp.where(is_left, fc, f))
+    _, min_value = vertex_of((ta, tb, tc), (va, vb, vc))
+    return (ta, tb, tc), (va, vb, vc), min_value
+
+
+def _next_search(
+    stages: _StageMargins,
+    tolerance: Array,
+    margins_at: Callable[[Array], tuple[Array, Array]],
+    search: _RootSearch,
+) -> _RootSearch:
+    """The search after one more evaluation; ``margins_at(x)``: margins and new levels (K, B)."""
+    in_minimum, in_upper_end = search.mode == MINIMUM, search.mode == UPPER_END
+    in_first, in_root = search.mode == FIRST, search.mode == ROOT
+    vertex = _point_towards_minimum(search)
+    x = jnp.where(in_upper_end, search.high, _secant(search, tolerance))
+    x = jnp.where(in_minimum, vertex, x)
+    margins, new_levels = margins_at(x)
+    is_negative = jnp.any(margins < 0, axis=0)
+
+    # minimum
+    f = _lowest(stages.minimum_switches, margins)
+    triple, values, min_value = _next_triple(search, vertex, f)
+    is_exhausted = (min_value > 0.7 * values[1]) | (search.count > 12)
+    minimum_is_negative = in_minimum & is_negative
+    # no root at the minimum: continue with the bracket of a stage
+    has_no_root = in_minimum & ~is_negative & is_exhausted
+
+    # a margin that is negative at a stage may be positive on dense output
+    is_false = in_upper_end & ~is_negative
+    has_later_root = is_false & jnp.any(stages.end_margins < 0, axis=0) & (search.high < 1)
+    retry_mode = jnp.where(search.count < _MAX_POSITIVE_EVALUATIONS, FIRST, UPPER_END)
+    mode = jnp.where(in_first, jnp.where(is_negative, ROOT, retry_mode), search.mode)
+    mode = jnp.where(in_upper_end, jnp.where(is_negative | has_later_root, ROOT, DONE), mode)
+    mode = jnp.where(minimum_is_negative, ROOT, jnp.where(has_no_root, stages.mode, mode))
+
+    # between low and high
+    moves_high = (in_root | in_first | in_upper_end | minimum_is_negative) & is_negative
+    moves_low = (in_root | in_first) & ~is_negative
+    same_end_twice = search.side == jnp.where(is_negative, 1, -1)
+    start_low = jnp.where(has_no_root, stages.low, search.low)
+    start_low = jnp.where(minimum_is_negative, search.triple[0], start_low)
+    low_margins = select_bodies(has_no_root, stages.at_low, search.at_low)
+    low_margins = select_bodies(minimum_is_negative, stages.minimum_start, low_margins)
+    new_low = jnp.where(moves_low, x, jnp.where(has_later_root, search.high, start_low))
+    new_high = jnp.where(
+        moves_high,
+        x,
+        jnp.where(has_later_root, 1, jnp.where(has_no_root, stages.high, search.high)),
+    )
+    factor = jnp.where((in_root | in_first) & same_end_twice, 0.5, 1)
+    new_at_low = select_bodies(
+        moves_low | has_later_root,
+        margins,
+        low_margins * jnp.where(moves_high, factor, 1)[None],
+    )
+    high_margins = select_bodies(
+        has_later_root,
+        stages.end_margins,
+        select_bodies(has_no_root, stages.at_high, search.at_high),
+    )
+    new_at_high = select_bodies(
+        moves_high, margins, high_margins * jnp.where(moves_low, factor, 1)[None]
+    )
+    remaining_width = (new_high - new_low) * (1 - _root_share(new_at_low, new_at_high))
+    is_converged = (
+        (mode == ROOT) & (remaining_width <= tolerance) & (moves_high | (in_root & moves_low))
+    )
+    stop = is_converged | (search.count >= _MAX_EVALUATIONS)
+    hit = search.hit | ((mode == ROOT) & stop)
+    starts_bracket = minimum_is_negative | has_no_root
+    return _RootSearch(
+        jnp.where(stop, DONE, mode),
+        new_low,
+        new_high,
+        new_at_low,
+        new_at_high,
+        select_bodies(moves_high, new_levels, search.new_levels)
+        if search.new_levels is not None
+        else None,
+        jnp.where(
+            in_root | in_first,
+            jnp.where(is_negative, 1, -1),
+            jnp.where(starts_bracket, 0, search.side),
+        ),
         triple,
         values,
-        zero_counts,
-        jnp.zeros_like(accepted),
+        jnp.where(starts_bracket, 0, search.count + 1),
+        hit,
     )
-    search = jax.lax.while_loop(lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)), iterate, search)
-    # halved margins keep their signs
-    flips = first_of_jumps(motion, search.at_high < 0)
-    fraction = search.high
-    if options.differentiable:
-        margins = partial(margins_at, constants=traced_constants)
-        fraction = _differentiable_fraction(search.hit, flips, fraction, margins)
-    is_lost = search.hit & ~jnp.any(flips, axis=0)
-    start_fraction = jnp.maximum(1e-3, 16 * eps * time_spacing)
-    # kinks and events have the levels 0 and 1
-    levels = 1 - progress.levels if search.new_levels is None else search.new_levels
-    return SwitchPoint(search.hit & ~is_lost, fraction, levels, flips, start_fraction)
 
 
 def is_unresolved(motion, margins: Array, rule: Tableau) -> Array:
@@ -315,30 +421,6 @@ def first_of_jumps(motion, flips: Array) -> Array:
     first_jump = jnp.min(jnp.where(flips & is_jump, order, motion.switches), axis=0)[None]
     is_event = order >= motion.switches - motion.events
     return flips & ((first_jump == motion.switches) | (order == first_jump) | is_event)
-
-
-DONE, ROOT, UPPER_END, MINIMUM, FIRST = range(5)
-"""Next action of the search in a step. DONE: nothing. ROOT: close the bracket between ``low`` and
-``high``, whose margin at ``high`` is negative. UPPER_END: check whether it is. MINIMUM: approach a
-minimum. FIRST: evaluate the secant's root before ``high`` has been checked."""
-
-
-class _RootSearch(NamedTuple):
-    """Carry of the search. ``mode``: see ``DONE``; ``at_low``, ``at_high`` (K, B): margins at the
-    ends of the bracket; ``side`` (B,): which end moved last; ``triple``, ``values``: three points
-    around a minimum and the lowest margin at each; ``count`` of evaluations."""
-
-    mode: Array
-    low: Array
-    high: Array
-    at_low: Array
-    at_high: Array
-    new_levels: Array | None
-    side: Array
-    triple: tuple[Array, ...]
-    values: tuple[Array, ...]
-    count: Array
-    hit: Array
 
 
 def _differentiable_fraction(hit: Array, flips: Array, fraction: Array, margins_at) -> Array:
