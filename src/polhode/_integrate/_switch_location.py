@@ -70,7 +70,7 @@ def first_switch(
     traced_constants = motion.coefficients, progress, attempt, t
     stopped_constants = jax.lax.stop_gradient(traced_constants)
     _, progress, attempt, t = stopped_constants
-    stages = _stage_margins(motion.rule, attempt, accepted)
+    start = _search_start(motion.rule, attempt, accepted)
     tolerance, time_spacing = _tolerance(motion, options, progress, attempt, t, eps)
 
     def margins_at(x, constants=stopped_constants):
@@ -81,21 +81,21 @@ def first_switch(
 
     zero_counts = jnp.zeros(attempt.h.shape, jnp.int32)
     search = _RootSearch(
-        jnp.where(stages.has_minimum, MINIMUM, stages.mode),
-        stages.low,
-        stages.high,
-        stages.at_low,
-        stages.at_high,
+        jnp.where(start.has_minimum, MINIMUM, start.mode),
+        start.low,
+        start.high,
+        start.at_low,
+        start.at_high,
         progress.levels if motion.jumps else None,
         zero_counts,
-        stages.triple,
-        stages.values,
+        start.triple,
+        start.values,
         zero_counts,
         jnp.zeros_like(accepted),
     )
     search = jax.lax.while_loop(
         lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)),
-        partial(_next_search, stages, tolerance, margins_at),
+        partial(_next_search, start, tolerance, margins_at),
         search,
     )
     # halved margins keep their signs
@@ -135,7 +135,7 @@ class _RootSearch(NamedTuple):
     hit: Array
 
 
-class _StageMargins(NamedTuple):
+class _SearchStart(NamedTuple):
     """The start of a search, from the margins at the stages.
 
     ``mode``, ``low``, ``high``, ``at_low``, ``at_high``: the bracket before the first stage with a
@@ -156,12 +156,8 @@ class _StageMargins(NamedTuple):
     minimum_start: Array
     end_margins: Array
 
-    def lowest(self, margins: Array) -> Array:
-        """The lowest of ``margins`` (K, B) of the switches that have the minimum."""
-        return jnp.min(jnp.where(self.minimum_switches, margins, jnp.inf), axis=0)
 
-
-def _stage_margins(rule: Tableau, attempt: Attempt, accepted: Array) -> _StageMargins:
+def _search_start(rule: Tableau, attempt: Attempt, accepted: Array) -> _SearchStart:
     """Bracket and minimum from which the search starts."""
     nodes = rule.margin_nodes
     sampled = margin_samples(attempt.margins, rule)
@@ -204,7 +200,7 @@ def _stage_margins(rule: Tableau, attempt: Attempt, accepted: Array) -> _StageMa
     # A negative margin at the last node is that of the state at the end of the step, and is
     # certain. Those at other nodes belong to stages, which are less accurate than dense output.
     is_at_end = has_bracket & (first_below == size - 1)
-    return _StageMargins(
+    return _SearchStart(
         jnp.where(is_at_end, ROOT, jnp.where(has_bracket, FIRST, DONE)),
         low,
         high,
@@ -288,7 +284,7 @@ def _next_triple(search: _RootSearch, x: Array, f: Array) -> tuple[tuple, tuple,
 
 
 def _next_search(
-    stages: _StageMargins,
+    start: _SearchStart,
     tolerance: Array,
     margins_at: Callable[[Array], tuple[Array, Array]],
     search: _RootSearch,
@@ -303,7 +299,7 @@ def _next_search(
     is_negative = jnp.any(margins < 0, axis=0)
 
     # minimum
-    f = _lowest(stages.minimum_switches, margins)
+    f = _lowest(start.minimum_switches, margins)
     triple, values, min_value = _next_triple(search, vertex, f)
     is_exhausted = (min_value > 0.7 * values[1]) | (search.count > 12)
     minimum_is_negative = in_minimum & is_negative
@@ -312,25 +308,25 @@ def _next_search(
 
     # a margin that is negative at a stage may be positive on dense output
     is_false = in_upper_end & ~is_negative
-    has_later_root = is_false & jnp.any(stages.end_margins < 0, axis=0) & (search.high < 1)
+    has_later_root = is_false & jnp.any(start.end_margins < 0, axis=0) & (search.high < 1)
     retry_mode = jnp.where(search.count < _MAX_POSITIVE_EVALUATIONS, FIRST, UPPER_END)
     mode = jnp.where(in_first, jnp.where(is_negative, ROOT, retry_mode), search.mode)
     mode = jnp.where(in_upper_end, jnp.where(is_negative | has_later_root, ROOT, DONE), mode)
-    mode = jnp.where(minimum_is_negative, ROOT, jnp.where(has_no_root, stages.mode, mode))
+    mode = jnp.where(minimum_is_negative, ROOT, jnp.where(has_no_root, start.mode, mode))
 
     # between low and high
     moves_high = (in_root | in_first | in_upper_end | minimum_is_negative) & is_negative
     moves_low = (in_root | in_first) & ~is_negative
     same_end_twice = search.side == jnp.where(is_negative, 1, -1)
-    start_low = jnp.where(has_no_root, stages.low, search.low)
+    start_low = jnp.where(has_no_root, start.low, search.low)
     start_low = jnp.where(minimum_is_negative, search.triple[0], start_low)
-    low_margins = select_bodies(has_no_root, stages.at_low, search.at_low)
-    low_margins = select_bodies(minimum_is_negative, stages.minimum_start, low_margins)
+    low_margins = select_bodies(has_no_root, start.at_low, search.at_low)
+    low_margins = select_bodies(minimum_is_negative, start.minimum_start, low_margins)
     new_low = jnp.where(moves_low, x, jnp.where(has_later_root, search.high, start_low))
     new_high = jnp.where(
         moves_high,
         x,
-        jnp.where(has_later_root, 1, jnp.where(has_no_root, stages.high, search.high)),
+        jnp.where(has_later_root, 1, jnp.where(has_no_root, start.high, search.high)),
     )
     factor = jnp.where((in_root | in_first) & same_end_twice, 0.5, 1)
     new_at_low = select_bodies(
@@ -340,8 +336,8 @@ def _next_search(
     )
     high_margins = select_bodies(
         has_later_root,
-        stages.end_margins,
-        select_bodies(has_no_root, stages.at_high, search.at_high),
+        start.end_margins,
+        select_bodies(has_no_root, start.at_high, search.at_high),
     )
     new_at_high = select_bodies(
         moves_high, margins, high_margins * jnp.where(moves_low, factor, 1)[None]
