@@ -1,1 +1,1 @@
-"""Evidence: accuracy, run time and stability, each by one command (see README.md)."""
+"""Benchmarks of accuracy, run time and stability; README.md contains the results."""

@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: run them all, draw figures, write pages.
+"""``python -m benchmarks``: run all benchmarks, draw figures, write the results page.
 
 python -m benchmarks [--quick] [--output FOLDER]   every benchmark, each in its own process
 python -m benchmarks figures FILE ... [--output FOLDER]
@@ -32,7 +32,7 @@ FULL["error_control"] = ["--bodies", "100"]
 
 
 def run(quick: bool, folder: Path) -> int:
-    """Run benchmarks and draw their figures; the number of those that failed."""
+    """Run benchmarks and draw their figures; returns the number of failed benchmarks."""
     failed, began = 0, time.perf_counter()
     for name, given in (QUICK if quick else FULL).items():
         if importlib.util.find_spec(f"benchmarks.{name}") is None:

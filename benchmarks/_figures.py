@@ -1,4 +1,4 @@
-"""Figures of the benchmarks, drawn from their JSON only."""
+"""Figures of the benchmarks, drawn from their JSON files alone."""
 
 import functools
 from collections.abc import Callable
@@ -34,7 +34,7 @@ DRAWN: dict[str, Callable] = {}
 
 
 def _drawn(function: Callable) -> Callable:
-    """A figure of a result, drawn in the style of the package."""
+    """Decorator: register a figure by the name of its result and draw it in the package's style."""
 
     @functools.wraps(function)
     def draw_report(report: dict, *options: Any) -> Any:
@@ -56,7 +56,7 @@ def _name(peer: str, program: str) -> str:
 
 
 def fronts(rows: list[dict]) -> dict[str, tuple[list, list]]:
-    """Name -> errors and times of a peer's settings that none of its own others beat."""
+    """Errors and times of the Pareto-optimal settings of each program, by name."""
     points: dict[str, list] = {}
     for row in rows:
         if row["attitude_median"] is not None:
@@ -75,7 +75,7 @@ def fronts(rows: list[dict]) -> dict[str, tuple[list, list]]:
 
 @_drawn
 def work_precision(plt, report: dict, families: tuple[str, ...] = ()):
-    """A panel per family: attitude error of the median of 1,000 bodies against time per body."""
+    """One panel per family: median attitude error of 1,000 bodies against time per body."""
     from polhode import plot
 
     tables = [t for t in report["numbers"]["tables"] if t["bodies"] == 1000]
@@ -95,7 +95,7 @@ def work_precision(plt, report: dict, families: tuple[str, ...] = ()):
         for line in ax.lines:
             if len(line.get_xdata()):
                 drawn[line.get_label()] = line
-            if len(line.get_xdata()) == 1:  # an exact method: one point serves every error
+            if len(line.get_xdata()) == 1:  # a closed form: its single point applies to every error
                 line.set_markersize(10)
         ax.get_legend().remove()
         ax.set_title(table["title"])
@@ -137,7 +137,7 @@ def scaling(plt, report: dict):
 
 @_drawn
 def gradients(plt, report: dict):
-    """Cost of value and gradient over the forward run, and the error of the gradient."""
+    """Time of value and gradient relative to that of the value, and error of the gradient."""
     rows = report["numbers"]["rows"]
     figure = plt.figure(figsize=(10.5, 0.3 * len(rows) + 0.9), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -167,7 +167,9 @@ def gradients(plt, report: dict):
 
 @_drawn
 def identification(plt, report: dict):
-    """Errors over the bound and cover of intervals, two standard errors; times beside SciPy."""
+    """Errors over the bound and coverage of the intervals, with bars of two standard errors; times
+    compared with SciPy.
+    """
     numbers = report["numbers"]
     rows = [*numbers["designs"], numbers["designs_pooled"]]
     names = [
@@ -204,7 +206,9 @@ def identification(plt, report: dict):
 
 @_drawn
 def throw_design(plt, report: dict):
-    """Deviation of the tensor after a throw, by direction of the spin and program of the wheel."""
+    """Standard deviation of the tensor after a throw, by direction of the spin and by the speed
+    programme of the wheel.
+    """
     figure = plt.figure(figsize=(10.0, 3.4), layout="constrained")
     axes = figure.subplots(1, 2)
     x = {
@@ -247,7 +251,7 @@ def engines(plt, report: dict):
 
 
 def save(figure, path: Path) -> Path:
-    """Write a figure, whole or not at all, without anything that changes from run to run."""
+    """Write a figure atomically, without metadata that change from run to run."""
     import matplotlib.pyplot as plt
 
     from polhode._atomic import atomic_write
@@ -261,7 +265,7 @@ def save(figure, path: Path) -> Path:
 
 
 def draw(paths: list[Path], folder: Path, suffix: str = ".svg") -> list[Path]:
-    """Draw the figures of the results at ``paths`` into ``folder``; the files."""
+    """Draw the figures of the results at ``paths`` into ``folder``; returns the files."""
     made = []
     for path in paths:
         report = read(path)

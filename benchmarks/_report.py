@@ -1,10 +1,10 @@
-"""What every benchmark shares: how it times, what it writes, where it reads.
+"""Shared by all benchmarks: timing, and reading and writing of results.
 
 A result is one JSON file with the fields ``name``, ``command``, ``date``, ``commit``,
 ``versions``, ``machine``, ``flags``, ``threads`` and ``numbers``; figures and tables are made from
 such files only. Results from before ``commit`` was recorded have ``committed_with`` instead: the
-commit that brought the file into the repository. Call ``one_thread()`` before the first import of
-jax for single-threaded numbers.
+commit that added the file to the repository. For single-threaded results call ``one_thread()``
+before the first import of jax.
 """
 
 import argparse
@@ -29,14 +29,14 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "out" / "benchmarks"
-"""Where runs write when nothing else is asked for."""
+"""Default folder for results."""
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "numpy")
 ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 def one_thread() -> None:
-    """Keep XLA to one thread and this process on one core; no effect once jax is running."""
+    """Restrict XLA to one thread and this process to one core; no effect once jax is imported."""
     os.environ.setdefault("XLA_FLAGS", ONE_THREAD)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -45,16 +45,19 @@ def one_thread() -> None:
 
 
 def compile_package() -> None:
-    """Write the package's bytecode, which pip writes when it installs the package: where Python
-    writes none (PYTHONDONTWRITEBYTECODE), each new process would compile the checkout's sources."""
+    """Write the bytecode of the package, as pip does at installation.
+
+    Otherwise, under PYTHONDONTWRITEBYTECODE, each new process compiles the sources of the checkout,
+    which its measured time would include.
+    """
     compileall.compile_dir(ROOT / "src", quiet=1)
 
 
 def commit() -> str | None:
-    """The commit that is measured, with ``-dirty`` where its code was changed; None: unknown.
+    """The measured commit, with ``-dirty`` if its code was changed; None if it is unknown.
 
-    Unknown without git, and where polhode is imported from elsewhere than this checkout. Results
-    and generated pages do not count as changes.
+    It is unknown without git, and if polhode is imported from outside this checkout. Results and
+    generated pages do not count as changes.
     """
     spec = importlib.util.find_spec("polhode")
     if spec is None or not Path(str(spec.origin)).resolve().is_relative_to(ROOT):
@@ -78,7 +81,7 @@ def _git(*words: str) -> str:
 
 
 def machine() -> dict[str, Any]:
-    """The machine without its name: processor, model, cores, memory, accelerator if any."""
+    """Processor, model, cores, memory and any accelerator of this machine, without its name."""
     processor, model = platform.machine(), platform.processor()
     about = Path("/proc/cpuinfo")
     if about.exists():
@@ -100,7 +103,7 @@ def machine() -> dict[str, Any]:
 
 
 def versions(*more: str) -> dict[str, str | None]:
-    """Versions of Python, polhode, JAX and what else is named; None: not installed."""
+    """Versions of Python, polhode, JAX and the named packages; None if not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
     for name in ("polhode", *PACKAGES, *more):
         if name in sys.modules and hasattr(sys.modules[name], "__version__"):
@@ -121,7 +124,7 @@ def threads() -> int:
 
 
 def command(module: str) -> str:
-    """The command of this run, without where it wrote to."""
+    """The command of this run without its output options."""
     words, given = [], iter(sys.argv[1:])
     for word in given:
         if word in ("--output", "--out", "--lines"):
@@ -139,11 +142,11 @@ def write(
     packages: tuple = (),
     module: str | None = None,
 ) -> Path:
-    """Write ``numbers`` (anything JSON can hold) of benchmark ``name``, which is that of the module
-    if none is given; returns the file.
+    """Write the ``numbers`` of benchmark ``name`` to a JSON file; returns its path.
 
-    ``path``: a file; None: ``out/benchmarks/<name>.json``. ``packages``: peers whose versions to
-    record beside ours. Not-a-number and infinite values become null. Whole or not at all.
+    ``path``: by default ``out/benchmarks/<name>.json``. ``packages``: other programs whose versions
+    are recorded. ``module``: the module in the recorded command, by default ``name``. NaN and
+    infinite values become null. The file is written atomically.
     """
     from polhode._atomic import atomic_write
 
@@ -168,7 +171,10 @@ def write(
 def recordings(
     about: str, usual: Path, switches: dict[str, str] | None = None
 ) -> argparse.Namespace:
-    """Options of a benchmark on recordings that are no part of the project; ends where absent."""
+    """Parse the options of a benchmark on recordings that are not part of the project.
+
+    Exits if the recordings are absent.
+    """
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--data", type=Path, default=usual)
     parser.add_argument("--output", type=Path)
@@ -181,7 +187,7 @@ def recordings(
 
 
 def read(what: str | os.PathLike) -> dict[str, Any]:
-    """A result: a file, or the name of a committed one."""
+    """Read a result, given as a file or as the name of a committed result."""
     path = Path(what)
     if path.suffix != ".json":
         path = RESULTS / f"{what}.json"
@@ -192,7 +198,7 @@ def read(what: str | os.PathLike) -> dict[str, Any]:
 
 
 def _plain(value):
-    """Without arrays and without numbers that JSON lacks; floats to five digits."""
+    """A copy that JSON can represent: lists for arrays, null for NaN, floats of five digits."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -205,8 +211,9 @@ def _plain(value):
 
 
 class Timing(NamedTuple):
-    """Seconds of one call: median and least of the repeats, half the interquartile range over the
-    median, how many repeats, and the seconds of the first call (compiling included)."""
+    """Seconds of one call: median and minimum of the repeats, half the interquartile range over the
+    median, number of repeats, and seconds of the first call (including compilation).
+    """
 
     median: float
     least: float
@@ -216,7 +223,7 @@ class Timing(NamedTuple):
 
 
 def clock(call: Callable[[], Any], **options) -> Timing:
-    """``in_turn`` of one."""
+    """``in_turn`` for a single call."""
     return in_turn({"": call}, **options)[""]
 
 
@@ -228,14 +235,14 @@ def in_turn(
     budget: float = 1.0,
     processor_time: bool = False,
 ) -> dict[str, Timing]:
-    """Time calls that return when they are done (block on JAX's results), taking turns.
+    """Time several calls alternately; each must block until its result is ready.
 
-    Turns make the ratios robust against a machine whose speed changes. Each repeat lasts at least
-    ``least`` seconds: calls are repeated within it, after one that is not counted. A call stops
-    taking part when it has used ``budget`` seconds, but not before two repeats, or one where a
-    single call lasts longer than that. The first call of each is not counted either.
-    ``processor_time``: of this process, in place of the time on the clock, which counts what other
-    processes of the machine take.
+    Alternation makes ratios robust against changes of the machine's speed. Each repeat lasts at
+    least ``least`` seconds: short calls are repeated within it, after one call that is not timed. A
+    call is no longer repeated once it has used ``budget`` seconds, but is timed at least twice, or
+    once if a single call exceeds the budget. The first call of each is not part of the median.
+    ``processor_time``: measure the CPU time of this process rather than wall time, which includes
+    the load of other processes.
     """
     now = time.process_time if processor_time else time.perf_counter
     first, count, spent = {}, {}, dict.fromkeys(calls, 0.0)
@@ -259,7 +266,7 @@ def in_turn(
             if len(spans[name]) >= repeats:
                 continue
             if count[name] > 1:
-                call()  # not counted: the caches hold what the others left there
+                call()  # not timed: the other calls have evicted this one's data from the caches
             begin = now()
             for _ in range(count[name]):
                 call()

@@ -1,4 +1,4 @@
-"""One classical Runge-Kutta step, for motions that benchmarks make up with noise in them."""
+"""One classical Runge-Kutta step, for benchmarks that simulate motions with random torques."""
 
 
 def runge_kutta(field, state, t, dt):

@@ -2,16 +2,17 @@
 
     python -m benchmarks.accelerator [--quick] [--any-device] [--output out/accelerator.json]
 
-Runs where JAX finds an accelerator, and otherwise writes the result "not run" (``--any-device``: it
-runs on the CPU too; ``--quick``: fewer and smaller rows, a minute or two). Beside polhode's default
-method stands diffrax as its documentation shows it (``vmap`` of a solve for each body, quaternion
-and rates, Dopri8), at the loosest tolerance 1e-3, 1e-4, ... whose median error of the attitude is
-not above that of polhode or the tolerance of this one, whichever is larger; where none is, at the
-one with the least error. In the same run a vector sum measures the memory bandwidth and a chain of
-fused multiply-adds the arithmetic peak of the dtype; beside each time stand the share of the
-bandwidth that reading the state and writing the result takes, and the share of the arithmetic peak
-of the operations that the compiler counts (for programs without loops over steps, whose body it
-counts once).
+Without an accelerator the result is "not run", unless ``--any-device`` permits the CPU.
+``--quick``: fewer and smaller rows, a minute or two. polhode's default method is compared with
+diffrax as its documentation shows it (``vmap`` of a solve for each body, quaternion and rates,
+Dopri8). diffrax runs at the loosest tolerance 1e-3, 1e-4, ... at which its median attitude error is
+at most the larger of polhode's error and polhode's tolerance; if there is none, at the tolerance
+with the smallest error.
+
+In the same run a vector sum measures the memory bandwidth, and a chain of fused multiply-adds the
+arithmetic peak of the dtype. Each row states two shares: that of the bandwidth, for reading the
+state and writing the result, and that of the arithmetic peak, for the operations that the compiler
+counts (only for programs without loops over steps, whose bodies it counts once).
 """
 
 import argparse
@@ -41,7 +42,7 @@ RTOL = {"float64": 1e-9, "float32": 1e-5}
 
 
 def peaks(dtype: str, size: int = 2**26, chain: int = 256) -> dict[str, float]:
-    """Bytes and operations per second of the device by two small programs."""
+    """Measured bandwidth [bytes/s] and arithmetic peak [operations/s] of the device."""
     x = jnp.ones(size, dtype)
     add = jax.jit(lambda x: x + 1).lower(x).compile()
     wall = _report.clock(lambda: jax.block_until_ready(add(x)), repeats=5)
@@ -49,7 +50,7 @@ def peaks(dtype: str, size: int = 2**26, chain: int = 256) -> dict[str, float]:
 
     def multiply_add(x):
         a = b = c = d = x
-        for _ in range(chain // 4):  # four chains at once, to hide the latency
+        for _ in range(chain // 4):  # four independent chains, to hide the latency
             a, b, c, d = (0.999 * y + 1e-3 for y in (a, b, c, d))
         return a + b + c + d
 
@@ -63,7 +64,7 @@ def peaks(dtype: str, size: int = 2**26, chain: int = 256) -> dict[str, float]:
 
 
 def measure(family: str, n: int, dtype: str, peak: dict[str, float]) -> dict:
-    """One row: the default method on n bodies."""
+    """One row: polhode's default method on n bodies."""
     problem = KNOWN[family]
     kind, record = np.dtype(dtype).type, ph.Record(final_only=problem.saves == 1)
     count = min(n, 100_000)
@@ -110,8 +111,9 @@ def measure(family: str, n: int, dtype: str, peak: dict[str, float]) -> dict:
 
 @cache
 def equal_error(family: str, dtype: str, target: float) -> tuple[float, dict[str, float]]:
-    """The loosest tolerance at which the median error of diffrax is at most ``target``, or else
-    the one with the least error, and the errors there."""
+    """The loosest tolerance at which the median error of diffrax is at most ``target``, and the
+    errors there; if there is none, those of the tolerance with the smallest error.
+    """
     problem = KNOWN[family]
     few = jnp.asarray(np.concatenate(problem.states(truth.BODIES), axis=1), dtype)
     times, exact = jnp.asarray(problem.times, dtype), truth.truth(problem)
@@ -128,7 +130,7 @@ def equal_error(family: str, dtype: str, target: float) -> tuple[float, dict[str
 
 
 def measure_diffrax(family: str, n: int, dtype: str, target: float) -> dict:
-    """The same bodies by diffrax at an error of at most ``target``, if this dtype can reach it."""
+    """One row: diffrax on the same bodies, at an error of at most ``target`` if it can reach it."""
     problem, n = KNOWN[family], min(n, DIFFRAX_BODIES)
     start = jnp.asarray(np.concatenate(problem.states(n), axis=1), dtype)
     times = jnp.asarray(problem.times, dtype)
@@ -190,7 +192,7 @@ def main() -> None:
 
 
 def _show(row: dict) -> None:
-    """One line of the table."""
+    """Print one line of the table."""
     shares = ""
     if "bandwidth_share" in row:
         share = row["arithmetic_share"]

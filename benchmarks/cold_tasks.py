@@ -1,12 +1,13 @@
-"""Ten tasks as a user types them, each from a cold process: seconds until the answer is there.
+"""Time to the result of eleven typical tasks, each in a new process.
 
     python -m benchmarks.cold_tasks [--quick] [--tasks NAME ...] [--output out/cold_tasks.json]
 
-Every task runs in a process of its own, once with polhode and once with the obvious alternative
-(SciPy, or diffrax by hand); imports are included. ``first``: from the start of the process to the
-first answer; ``second``: the same call again; ``cached``: a later process that finds compiled
-programs in JAX's persistent cache; ``memory``: the largest resident size. Errors are those of the
-attitude or of the number asked for, against a tight solution by the other library.
+Each task runs in a process of its own with polhode and, for some tasks, with a common alternative
+(SciPy, or diffrax by hand). Times include imports. ``first``: from the start of the process to the
+first result; ``second``: the same call again; ``cached``: to the first result of a later process
+that loads compiled programs from JAX's persistent cache; ``memory``: the maximum resident size.
+Errors are those of the attitude or of the requested number, relative to a solution of the other
+library at a tight tolerance.
 """
 
 import argparse
@@ -29,7 +30,7 @@ RATES = (0.3, 0.2, 3.0)
 MU, AXIS = 3.986004418e14, 6.871e6
 
 
-# Each task: a function that imports what it needs and returns the call; the call returns numbers.
+# A task is a function that imports what it needs and returns the call; the call returns numbers.
 
 
 def free_body() -> Callable:
@@ -49,7 +50,7 @@ def free_body() -> Callable:
 
 
 def free_body_scipy(tight: bool = False) -> Callable:
-    """By SciPy."""
+    """The same by SciPy."""
     return _scipy(lambda t, wxyz, omega: 0.0, 100.0, tight)
 
 
@@ -66,7 +67,7 @@ def heavy_top() -> Callable:
 
 
 def heavy_top_scipy(tight: bool = False) -> Callable:
-    """By SciPy."""
+    """The same by SciPy."""
     import numpy as np
 
     def torque(t, wxyz, omega):
@@ -78,7 +79,9 @@ def heavy_top_scipy(tight: bool = False) -> Callable:
 
 
 def lagrange_gradient() -> Callable:
-    """Lagrange's top for 20 s and the derivative of its last height by the distance."""
+    """Lagrange's top for 20 s, and the derivative of its final height with respect to the distance
+    of the centre of mass.
+    """
     import jax
 
     import polhode as ph
@@ -94,7 +97,7 @@ def lagrange_gradient() -> Callable:
 
 
 def lagrange_gradient_diffrax(tight: bool = False) -> Callable:
-    """By diffrax."""
+    """The same by diffrax."""
     import jax
     import jax.numpy as jnp
 
@@ -138,7 +141,7 @@ def satellite() -> Callable:
 
 
 def satellite_diffrax(tight: bool = False) -> Callable:
-    """By diffrax, twenty lines."""
+    """The same by diffrax, twenty lines."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -177,7 +180,7 @@ def _magnetorquers(np):
 
 
 def event() -> Callable:
-    """The time at which the rates of this satellite fall to 0.1 deg/s."""
+    """The time at which the rate of this satellite falls to 0.1 deg/s."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -189,7 +192,7 @@ def event() -> Callable:
 
 
 def event_scipy(tight: bool = False) -> Callable:
-    """By SciPy."""
+    """The same by SciPy."""
     import numpy as np
     from scipy.integrate import solve_ivp
 
@@ -218,7 +221,7 @@ def event_scipy(tight: bool = False) -> Callable:
 
 
 def monte_carlo(bodies: int = 2000) -> Callable:
-    """2,000 of this satellite, six hours, last states."""
+    """2,000 copies of this satellite for six hours; last states."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -232,7 +235,7 @@ def monte_carlo(bodies: int = 2000) -> Callable:
 
 
 def flyby(bodies: int = 500) -> Callable:
-    """500 clones of an asteroid through a hyperbolic passage of the Earth, 101 times."""
+    """500 clones of an asteroid on a hyperbolic passage of the Earth, 101 times."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -269,7 +272,7 @@ def filter_steps() -> Callable:
 
 
 def control() -> Callable:
-    """A rest-to-rest turn: 20 gradient steps on the width of two pulses."""
+    """A rest-to-rest rotation: 20 gradient steps on the widths of two pulses."""
     import jax
     import jax.numpy as jnp
 
@@ -314,7 +317,7 @@ def toss() -> Callable:
 
 
 def view() -> Callable:
-    """An HTML page that shows a tumbling body."""
+    """An HTML page of a tumbling body."""
     import jax.numpy as jnp
 
     import polhode as ph
@@ -388,13 +391,13 @@ TASKS: dict[str, tuple[Callable, Callable | None, str]] = {
 
 
 def _child(name: str, which: str) -> dict:
-    """In a process of its own: the seconds, the answer and the memory."""
+    """Run one task in this process: seconds, result and memory."""
     import numpy as np
 
     ours, other, peer = TASKS[name]
     make = ours if which == "polhode" else other
     assert make is not None
-    if which == "polhode" or peer == "diffrax":  # SciPy does without JAX
+    if which == "polhode" or peer == "diffrax":  # SciPy does not need JAX
         import jax
 
         jax.config.update("jax_enable_x64", True)
@@ -423,7 +426,7 @@ def _in_process(name: str, which: str, cache: str | None = None) -> dict:
 
 
 def apart(a: list[float], b: list[float]) -> float:
-    """Distance of two answers, over the size; quaternions of either sign."""
+    """Relative distance of two results; the sign of a quaternion is ignored."""
     import numpy as np
 
     x, y = np.array(a), np.array(b)
@@ -432,7 +435,7 @@ def apart(a: list[float], b: list[float]) -> float:
 
 
 def measured(names: list[str], repeats: int) -> list[dict]:
-    """A row for each task: the least of some runs in turn."""
+    """One row for each task and program: the minima over alternating runs."""
     _report.compile_package()
     rows = []
     for name in names:
@@ -458,7 +461,7 @@ def measured(names: list[str], repeats: int) -> list[dict]:
 
 
 def side_by_side(rows: list[dict]) -> list[dict]:
-    """polhode and the other library in one flat row for each task."""
+    """One row for each task with the results of polhode and of the other library."""
     found = []
     for row in rows:
         ours, other = row["polhode"], row["peer"] or {}

@@ -1,10 +1,10 @@
-"""Energy and angular momentum of default methods over 1e5 revolutions.
+"""Energy and angular momentum of polhode's default methods over 1e5 revolutions.
 
     python -m benchmarks.conservation [--turns 100000] [--quick] [--output FILE]
 
-One body of each scene by ``ph.simulate`` with its defaults (but for ``max_steps``), in float64 and
-float32. Relative changes of the energy and of the angular momentum: in space where nothing acts, of
-the vertical component under uniform gravity.
+One body of each scene is simulated by ``ph.simulate`` with its defaults (except ``max_steps``), in
+float64 and float32. The table contains relative changes of the energy and of the angular momentum:
+of the whole vector in space for free bodies, of its vertical component under uniform gravity.
 """
 
 import argparse
@@ -21,7 +21,7 @@ import numpy as np
 
 import polhode as ph
 
-SAMPLES = 10  # at logarithmic distances up to the last time
+SAMPLES = 10  # with logarithmic spacing up to the last time
 
 
 def scenes() -> dict[str, tuple[ph.Scene, list[float]]]:
@@ -44,7 +44,7 @@ def scenes() -> dict[str, tuple[ph.Scene, list[float]]]:
 
 
 def measure(name: str, dtype: str, turns: int) -> list[dict]:
-    """A row for each factor of ten of revolutions: the largest changes up to there."""
+    """One row for each power of ten of revolutions: the largest changes up to that time."""
     scene, rates = scenes()[name]
     scene = jax.tree.map(lambda x: np.asarray(x, dtype), scene)
     state = ph.State(np.array([0.9, 0.3, 0.2, 0.1], dtype), np.array(rates, dtype))

@@ -1,16 +1,16 @@
-"""Gradients through controllers: a mean cost by all weights of a network, and by a few gains.
+"""Gradients of a mean cost with respect to all weights of a network controller, and to a few gains.
 
     python -m benchmarks.controllers [--quick] [--many] [--lines FILE] [--output FILE]
 
-A network of 7, 32, 32 and 3 units (1,411 parameters, relu or tanh) sees the attitude and rates of a
-body and gives a torque of at most 2 along each axis, for 5 s. The mean over the bodies of the cost
-of their last states is differentiated in reverse mode: by polhode's plain call, and by diffrax as a
-user writes it (``jax.vmap``, ``PIDController``, ``RecursiveCheckpointAdjoint``). Errors are norms
-over that of the gradient, against polhode at a tolerance of 1e-11, which is compared along two
-directions with central differences of solutions by SciPy's DOP853. Times are processor time of one
-core, the least of some runs in turn, or the only run of a program that takes longer than 4 s.
-``--many`` adds 4,096 bodies. ``--lines``: a file to which results are appended as they are
-computed; with it, those that it already holds are not computed again.
+A network with layers of 7, 32, 32 and 3 units (1,411 parameters, relu or tanh) maps the attitude
+and rates of a body to a torque of at most 2 along each axis, for 5 s. The mean cost of the last
+states of all bodies is differentiated in reverse mode: by an ordinary call of polhode, and by
+diffrax as a user would write it (``jax.vmap``, ``PIDController``, ``RecursiveCheckpointAdjoint``).
+Errors are norms relative to that of the gradient. The reference is polhode at a tolerance of 1e-11,
+which is compared with central differences of SciPy's DOP853 along two directions. Times are
+processor times of one core: the minimum of several runs, or the only run of a program that takes
+longer than 4 s. ``--many`` adds 4,096 bodies. ``--lines``: a file to which each result is appended
+when it is computed; results that the file already contains are not computed again.
 """
 
 import argparse
@@ -48,14 +48,14 @@ BUDGET = 4.0
 
 
 class Network(eqx.Module):
-    """Attitude and rates to a bounded torque."""
+    """A network from attitude and rates to a bounded torque."""
 
     layers: eqx.nn.MLP
 
     def __init__(self, activation: str, hidden: int = 32, dtype: Any = np.float64):
         function = {"relu": jax.nn.relu, "tanh": jnp.tanh}[activation]
         layers = eqx.nn.MLP(7, 3, hidden, 2, function, key=jax.random.key(2), dtype=jnp.float64)
-        # the same weights rounded: random numbers of another dtype are others
+        # the same weights, rounded: another dtype would draw different random numbers
         self.layers = jax.tree.map(
             lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, layers
         )
@@ -65,7 +65,7 @@ class Network(eqx.Module):
 
 
 class Linear(eqx.Module):
-    """Gains (3, 7), the torque limited as ``limit`` says."""
+    """A linear controller with gains (3, 7), whose torque is limited according to ``limit``."""
 
     gains: jax.Array
     limit: Callable = eqx.field(static=True)
@@ -75,19 +75,21 @@ class Linear(eqx.Module):
 
 
 def states(bodies: int, dtype: Any = np.float64) -> ph.State:
-    """The first ``bodies`` of a sequence of random attitudes and rates."""
+    """The first ``bodies`` of a fixed sequence of random attitudes and rates."""
     numbers = np.random.default_rng(0).normal(size=(max(bodies, 4096), 7))[:bodies]
     wxyz = numbers[:, :4] / np.linalg.norm(numbers[:, :4], axis=1, keepdims=True)
     return ph.State(jnp.asarray(wxyz, dtype), jnp.asarray(0.5 * numbers[:, 4:], dtype))
 
 
 def cost(wxyz, omega):
-    """Of attitudes (..., 4) and rates (..., 3): the squared sine of half the angle, and rates."""
+    """Squared sine of half the angle of attitudes (..., 4), plus a tenth of the squared rates
+    (..., 3).
+    """
     return 1 - wxyz[..., 0] ** 2 + 0.1 * (omega**2).sum(axis=-1)
 
 
 def polhode_loss(state: ph.State, rtol: float) -> Callable:
-    """Mean cost of a controller by ``ph.simulate``."""
+    """Mean cost of a controller, simulated by ``ph.simulate``."""
     dtype = state.wxyz.dtype
     inertia, ts = ph.Inertia.from_moments(jnp.asarray(MOMENTS, dtype)), jnp.array([0.0, HORIZON])
 
@@ -100,7 +102,7 @@ def polhode_loss(state: ph.State, rtol: float) -> Callable:
 
 
 def diffrax_loss(state: ph.State, solver: Any) -> Callable:
-    """Mean cost of a controller at a tolerance by diffrax."""
+    """Mean cost of a controller, simulated by diffrax at a tolerance."""
     import diffrax
 
     dtype = state.wxyz.dtype
@@ -134,7 +136,7 @@ def diffrax_loss(state: ph.State, solver: Any) -> Callable:
 
 
 class Program:
-    """A compiled gradient, the processor time that compiling it took [s], and its memory [MB]."""
+    """A compiled gradient, the processor time of its compilation [s], and its memory [MB]."""
 
     def __init__(self, loss: Callable, controller: Any, *more: Any, slope: bool = True):
         arrays, rest = eqx.partition(controller, eqx.is_inexact_array)
@@ -156,8 +158,9 @@ class Program:
 
 
 def seconds(calls: dict[Any, Callable], repeats: int) -> tuple[dict[Any, float], dict[Any, Any]]:
-    """Least processor time of each, taking turns, and the results. The first run is only counted
-    where there is no second one."""
+    """Minimum processor time of each program over alternating runs, and the results. The first run
+    counts only if there is no second one.
+    """
     least, spent, results = {}, dict.fromkeys(calls, 0.0), {}
     for turn in range(1 + repeats):
         for name, call in calls.items():
@@ -171,12 +174,14 @@ def seconds(calls: dict[Any, Callable], repeats: int) -> tuple[dict[Any, float],
 
 
 def apart(slope: np.ndarray, exact: np.ndarray) -> float:
-    """Norm of the error over that of the gradient."""
+    """Norm of the error relative to that of the gradient."""
     return float(np.linalg.norm(slope - exact) / np.linalg.norm(exact))
 
 
 def differences(activation: str, exact: np.ndarray, bodies: int, step: float = 1e-4) -> list[float]:
-    """Differences between the gradient and SciPy's along itself and along a random direction."""
+    """Differences between the gradient and SciPy's derivatives, along the gradient and along a
+    random direction.
+    """
     from scipy.integrate import solve_ivp
 
     network, state = Network(activation), states(bodies)
@@ -223,7 +228,7 @@ def measure(
     exact: np.ndarray,
     repeats: int = 3,
 ) -> list[dict]:
-    """Rows of one network and number of bodies."""
+    """Rows of one network and one number of bodies."""
     import diffrax
 
     network, state = Network(activation, dtype=dtype), states(bodies, dtype)
@@ -270,7 +275,7 @@ def _gains():
 
 
 def measure_kind(kind: str, bodies: int, rtol: float = 1e-6, repeats: int = 3) -> dict:
-    """The gradient of polhode's plain call beside the value alone."""
+    """The gradient of an ordinary call of polhode, compared with the value alone."""
     controller, state = KINDS[kind](), states(bodies)
     value = Program(polhode_loss(state, rtol), controller, slope=False)
     both = Program(polhode_loss(state, rtol), controller)
@@ -292,8 +297,9 @@ def measure_kind(kind: str, bodies: int, rtol: float = 1e-6, repeats: int = 3) -
 
 
 def time_to_error(rows: list[dict]) -> list[dict]:
-    """Of each program the least time [ms] of its tolerances whose error is below a level; None:
-    no tolerance reaches it."""
+    """For each program the minimum time [ms] over the tolerances whose error is below a level; None
+    if no tolerance reaches the level.
+    """
     names = "activation", "bodies", "dtype", "program"
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
@@ -310,7 +316,7 @@ def time_to_error(rows: list[dict]) -> list[dict]:
 
 
 def _exact(activation: str, bodies: int) -> Callable[[], np.ndarray]:
-    """The gradient at the tolerance of reference, computed when it is first asked for."""
+    """The gradient at the reference tolerance, computed at its first use."""
     return functools.cache(
         lambda: Program(polhode_loss(states(bodies), REFERENCE), Network(activation))()[1]
     )
@@ -322,7 +328,7 @@ def _check(activation: str, bodies: int, exact: np.ndarray) -> dict:
 
 
 def _known(lines: Path | None) -> dict[tuple, list[dict]]:
-    """Results that a file holds, by table and key."""
+    """Results that a file contains, by table and key."""
     if lines is None or not lines.exists():
         return {}
     entries = [json.loads(line) for line in lines.read_text().splitlines()]

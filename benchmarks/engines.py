@@ -1,13 +1,13 @@
-"""Physics engines beside the exact motion of tumbling bodies: attitude, energy, momentum.
+"""Physics engines against the exact motion of tumbling bodies: attitude, energy, momentum.
 
     python -m benchmarks.engines [--quick] [--output out/benchmarks/engines.json]
 
-A free body is given to each engine that is installed: MuJoCo with three integrators, and Bullet.
-Damping, gravity, contacts and resets are switched off. The steps are the default of MuJoCo, 2 ms,
-314 in a revolution at 10 rad/s. Errors are angles against the closed form of polhode, which a test
-compares with the data of ``polhode reference``; energy and the angular momentum in space are
-relative to the initial ones. Last, a body whose gyroscopic term is left out: it keeps its angular
-velocity in space.
+Each engine that is installed simulates a free body: MuJoCo with three integrators, and Bullet.
+Damping, gravity, contacts and resets are disabled. The step is MuJoCo's default, 2 ms, which is 314
+steps per revolution at 10 rad/s. Attitude errors are angles to polhode's closed form, which a test
+compares with the data of ``polhode reference``; errors of the energy and of the angular momentum in
+space are relative to the initial values. The last row is a body without the gyroscopic term, whose
+angular velocity in space is constant.
 """
 
 import argparse
@@ -51,7 +51,8 @@ Run = Callable[[dict, list[int]], tuple[np.ndarray, np.ndarray]]
 def mujoco_run(integrator: str) -> Run:
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda text: None)  # of motions that diverge: they are NaN below
+    # MuJoCo warns of motions that diverge; they become NaN below
+    mujoco.set_mju_user_warning(lambda text: None)
 
     def run(body: dict, saves: list[int]) -> tuple[np.ndarray, np.ndarray]:
         moments = " ".join(map(repr, map(float, body["moments"])))
@@ -123,7 +124,7 @@ def without_gyroscopic_term(body: dict, saves: list[int]) -> tuple[np.ndarray, n
 
 
 def engines() -> dict[str, tuple[str, Run]]:
-    """Name -> package and run, of what is installed."""
+    """Name -> package and function to run, for each installed engine."""
     found: dict[str, tuple[str, Run]] = {}
     if importlib.util.find_spec("mujoco"):
         for integrator in ("Euler", "implicitfast", "RK4"):
@@ -153,9 +154,9 @@ def exact(body: dict, saves: list[int]) -> np.ndarray:
 
 
 def score(body: dict, saves: list[int], truth: np.ndarray, q: np.ndarray, w: np.ndarray) -> dict:
-    """Errors at the saved times: angle [rad]; energy and momentum relative to the first ones."""
+    """Errors at the saved times: angle [rad]; energy and momentum relative to the initial ones."""
     size = np.linalg.norm(q, axis=1, keepdims=True)
-    # |q - p| keeps digits where the angle is small
+    # |q - p| is accurate for small angles
     near = np.minimum(
         np.linalg.norm(q / size - truth, axis=1), np.linalg.norm(q / size + truth, axis=1)
     )
@@ -191,8 +192,9 @@ def measure(turns: float, count: int = 25) -> list[dict]:
 
 
 def after_turns(rows: list[dict]) -> list[dict]:
-    """Attitude errors [rad] and relative changes of the energy after 1 to 1,000 revolutions, at
-    the nearest saved times."""
+    """Attitude errors [rad] and relative changes of the energy after 1 to 1,000 revolutions, at the
+    nearest saved times.
+    """
     found = []
     for row in rows:
         at = {

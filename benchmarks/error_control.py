@@ -1,18 +1,20 @@
-"""Whether ``rtol`` is kept: random scenes over six decades, against long-double truth.
+"""Whether errors stay below ``rtol``: random scenes over six decades against 80-bit references.
 
 python -m benchmarks.error_control [--bodies 150] [--quick] [--constants] [--output FILE]
 
-Two tables. The first holds the estimate of a single step's error (``_integrate/_midpoint.py``)
-beside the step's true error, for orders and widths of step. The second holds the error of the
-attitude at the last time over the ``rtol`` asked for, on bodies whose moments, rates, fields and
-torques are drawn over six decades, ratios of torque to kinetic energy from 1e-6 to 1e3, 1 to 1,000
-radians. ``--constants [NAME ...]`` prints a third one only: steps, time and errors of some of these
-bodies and of others with each constant of ``_integrate/_error_control.py`` at the value at which it
-does nothing.
+There are two tables. The first compares the estimate of a single step's error
+(``_integrate/_midpoint.py``) with the true error, for several orders and step sizes. The second
+contains the attitude error at the last time divided by the requested ``rtol``, for bodies whose
+moments, rates, fields and torques are drawn over six decades: ratios of torque to kinetic energy
+from 1e-6 to 1e3, rotations by 1 to 1,000 radians. ``--constants [NAME ...]`` prints only a third
+table: steps, time and errors for some of these and other bodies when one constant of
+``_integrate/_error_control.py`` is set to the value at which it has no effect.
 
-Truth: Gragg's extrapolation of order 20 in 80-bit arithmetic, written out in NumPy from Newton's
-law, with two widths of step that must agree. ``spread``: how much more than linearly with the angle
-turned a small change of the momentum grows; beyond 100 a body counts as chaotic and is left out."""
+Reference: Gragg's extrapolation of order 20 in 80-bit arithmetic, written in NumPy from Newton's
+law, with two step sizes whose results must agree. ``spread``: growth of a small change of the
+momentum relative to growth in proportion to the rotation angle; bodies above 100 are treated as
+chaotic and excluded.
+"""
 
 import argparse
 import time
@@ -48,7 +50,7 @@ RTOLS = (1e-3, 1e-6, 1e-9, 1e-12)
 
 
 def weights() -> list:
-    """Of the columns, in long double."""
+    """Weights of the extrapolation columns, in long double."""
     found = []
     for j, n in enumerate(SEQUENCE):
         weight = Fraction(1)
@@ -63,7 +65,7 @@ def cross(a, b):
 
 
 def rates(p: dict, y):
-    """dL/dt and dq/dt of bodies side by side, from Newton's law."""
+    """dL/dt and dq/dt of several bodies, from Newton's law."""
     momentum, (w, x, z, v) = y[:3], y[3:]  # quaternion w + x i + z j + v k
     omega = [momentum[i] / p["moments"][i] for i in range(3)]
     rows = [
@@ -99,12 +101,12 @@ def rates(p: dict, y):
 
 
 def truth(p: dict, width: float, nudge=0.0):
-    """Final states (7, N) in steps of about ``width`` radians."""
+    """Final states (7, N), integrated in steps of about ``width`` radians."""
     p = {k: np.asarray(x, LONG) if k != "name" else x for k, x in p.items()}
     y = np.concatenate([p["moments"] * p["omega"] * (1 + LONG(nudge)), p["wxyz"]])
     y[3:] /= np.sqrt((y[3:] ** 2).sum(0))
     steps = np.maximum(2, np.ceil(p["angle"].astype(float) / width)).astype(int)
-    order = np.argsort(-steps)  # the longest first: who has arrived is cut off at the end
+    order = np.argsort(-steps)  # the longest first: finished bodies are dropped from the end
     p = {k: x[..., order] for k, x in p.items() if k != "name"}
     y, steps = y[:, order], steps[order]
     h, columns = p["span"] / steps, weights()
@@ -126,14 +128,14 @@ def truth(p: dict, width: float, nudge=0.0):
 
 
 def angle(p, q) -> np.ndarray:
-    """Between attitudes (4, N) [rad]."""
+    """Angles [rad] between attitudes (4, N)."""
     sign = np.where((p * q).sum(0) < 0, -1, 1)
     gap = np.sqrt(((p - sign * q) ** 2).sum(0)).astype(float)
     return 4 * np.arcsin(np.minimum(1, gap / 2))
 
 
 def draw(name: str, count: int, seed: int, longest: float) -> dict:
-    """Bodies of a family; everything over six decades."""
+    """Random bodies of a family; all quantities are drawn over six decades."""
     rng = np.random.default_rng(seed)
 
     def decades(low, high, size=count):
@@ -143,7 +145,7 @@ def draw(name: str, count: int, seed: int, longest: float) -> dict:
         v = rng.normal(size=(size, count))
         return v / np.linalg.norm(v, axis=0)
 
-    masses = decades(-1.5, 0, (3, count))  # on the three axes: moments that a body can have
+    masses = decades(-1.5, 0, (3, count))  # point masses on the axes, for possible moments
     moments = (masses.sum(0) - masses) * decades(-3, 3)
     rate = decades(-3, 3)
     omega = directions() * rate
@@ -257,7 +259,7 @@ def calibrated(count: int, seed: int) -> list[dict]:
                     fine = step(fine, wide / rate / 8, table(20, jnp.float64)).change
                 true = size([a - b for a, b in zip(found.change, fine)])
                 last, before = size(found.difference), size(found.lower_difference)
-                seen = (true > 1e-13) & (true < 0.1)  # above rounding, where the table converges
+                seen = (true > 1e-13) & (true < 0.1)  # above rounding, and converging
                 if seen.sum() < count // 20:
                     continue
                 ratio = (true / (last * np.minimum(1, last / before)))[seen]
@@ -306,7 +308,7 @@ have none."""
 
 
 def hidden_jump(t, wxyz, omega_body):
-    """A torque that jumps every 3.5 s where a loop hides it, so that no step ends at the jump."""
+    """A torque that jumps every 3.5 s inside a loop, so that no step ends at the jump."""
     on = jax.lax.while_loop(lambda c: (t % 7 > 3.5) & (c == 0), lambda c: c + 1.0, 0.0 * t)
     return 0.02 * on * jnp.ones_like(omega_body)
 
@@ -317,13 +319,13 @@ def clipped(t, wxyz, omega_body):
 
 
 def rooted(t, wxyz, omega_body):
-    """A torque that is not defined beyond its switch."""
+    """A torque that is undefined beyond its switch."""
     x = wxyz[..., 1:2]
     return 0.02 * jnp.where(x > 0, jnp.sqrt(x), 0.0) * jnp.ones_like(omega_body)
 
 
 def span_of(p: dict, angle: float) -> dict:
-    """The same bodies until each has turned by about ``angle`` [rad]."""
+    """The same bodies, simulated until each has rotated by about ``angle`` [rad]."""
     return p | {"angle": np.full_like(p["angle"], angle), "span": p["span"] * angle / p["angle"]}
 
 
@@ -356,8 +358,9 @@ def scenes_of_constants(count: int) -> dict[str, tuple]:
 
 
 def without(count: int, names: list[str]) -> list[dict]:
-    """Rows of the third table: sums over the bodies and over three tolerances. ``steps``: refused
-    ones too."""
+    """Rows of the third table: sums over the bodies and over three tolerances. ``steps`` includes
+    rejected steps.
+    """
     from polhode._integrate import _error_control as control
 
     scenes = scenes_of_constants(count)
@@ -418,14 +421,14 @@ def without(count: int, names: list[str]) -> list[dict]:
 
 
 def summary(rows: list[dict]) -> list[dict]:
-    """One row for each constant: the motions together."""
+    """One row for each constant, over all motions."""
     base = {row["scene"]: row for row in rows if not row["constant"]}
     found = []
     for name in dict.fromkeys(row["constant"] for row in rows if row["constant"]):
         own = [row for row in rows if row["constant"] == name]
         ended = [row for row in own if row["q95"] is not None]
         most = max(ended, key=lambda row: row["steps_ratio"])
-        # where 95 % of the bodies keep a tenth of rtol anyway, the ratio of errors says nothing
+        # errors below a tenth of rtol count as a tenth: their ratio would be meaningless
         errors = [row["q95"] / max(0.1, base[row["scene"]]["q95"]) for row in ended]
         found.append(
             {

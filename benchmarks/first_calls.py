@@ -1,11 +1,12 @@
-"""What the first calls of a new process cost: tracing, lowering and compiling, before any work.
+"""Cost of the first calls in a new process: tracing, lowering and compilation.
 
     python -m benchmarks.first_calls [--quick] [KIND ...] [--output FILE]
 
-Each kind of scene has a process of its own without a cache of programs. ``value`` is the first
-``ph.simulate`` as typed, ``gradient`` the first ``jax.grad`` of a number made of it by the
-principal moments and the initial rates, after that. The stages of the two are those of one program
-under ``jax.jit`` in a second process. Seconds of processor time of one core; imports are apart.
+Each kind of scene runs in its own process without a compilation cache. ``value`` is the first
+ordinary call of ``ph.simulate``; ``gradient`` is the first ``jax.grad`` after it, of a scalar
+function of the motion with respect to the principal moments and the initial rates. The stages of
+both are those of one program under ``jax.jit`` in a second process. Times are processor times [s]
+of one core; imports are listed separately.
 """
 
 import argparse
@@ -30,7 +31,7 @@ STAGES = ("trace", "lower", "compile")
 
 
 def _problem(kind: str):
-    """A function of moments and rates that simulates, and what it is given."""
+    """A function of moments and rates that simulates, and its arguments."""
     import jax.numpy as jnp
 
     import polhode as ph
@@ -64,18 +65,18 @@ def _problem(kind: str):
 
 
 def _child(kind: str, staged: bool) -> dict:
-    """In a process of its own: seconds of the first calls, or of the stages of their programs."""
+    """Seconds of the first calls in this process, or of the stages of their programs."""
     begin = time.process_time()
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    import diffrax  # noqa: F401 (here, for it is slow to import)
+    import diffrax  # noqa: F401 (so that its import counts below)
 
     import polhode as ph
     import polhode.fit
 
     simulated, loss, given = _problem(kind)
-    ph.simulate  # noqa: B018 (names are imported when they are asked for)
+    ph.simulate  # noqa: B018 (imports the lazy name)
     jax.block_until_ready(jax.jit(lambda x: x + 1)(given[0]))
     found = {"imports": time.process_time() - begin}
     slope = jax.grad(loss, argnums=(0, 1))
@@ -98,7 +99,7 @@ def _child(kind: str, staged: bool) -> dict:
 
 
 def measure(kind: str, repeats: int) -> dict:
-    """One row: the least of the repeats of every number."""
+    """One row: for each number the minimum over the repeats."""
     _report.compile_package()
     environment = {
         **os.environ,

@@ -1,9 +1,10 @@
-"""The exact free motion: errors beside times, with heyoka in the same run when installed.
+"""The closed-form free motion: errors and times, with heyoka in the same run if it is installed.
 
-Bodies, truth and scores are made here: four inertias, attitudes uniform on SO(3), isotropic rates
-with |w| uniform in [1, 2). Truth is a 34-digit Taylor series (tests/free/reference_free.py) for the
-first bodies of each case, kept in a cache beside this script, or the tables in ../shared where they
-are. Times are the least of repeats on one core.
+Bodies, references and scores are computed here: four inertias, attitudes uniform on SO(3),
+isotropic rates with |w| uniform in [1, 2). The reference is a 34-digit Taylor series
+(tests/free/reference_free.py) for the first bodies of each case, cached in the folder of this
+script, or read from the tables in ../shared if these exist. Times are minima of repeats on one
+core.
 
     python -m benchmarks.free_body [--quick] [--output free_body.json]
 """
@@ -39,13 +40,13 @@ SEEDS = {"A": 11, "B": 12, "C": 13, "D": 14}
 
 
 def bodies(case: str, count: int):
-    """Attitudes and rates; the first bodies of any count are the same."""
+    """Random attitudes and rates; the first bodies are the same for any count."""
     from math import erf
 
     r = np.random.Generator(np.random.PCG64(SEEDS[case])).standard_normal((count, 8))
     q = r[:, :4] / np.linalg.norm(r[:, :4], axis=1, keepdims=True)
     direction = r[:, 4:7] / np.linalg.norm(r[:, 4:7], axis=1, keepdims=True)
-    # In this order of operations, to the last bit the inputs of the tables of truth.
+    # The order of operations reproduces the inputs of the stored references to the last bit.
     size = 1.0 + 0.5 * (1.0 + np.array([erf(x) for x in r[:, 7] / np.sqrt(2.0)]))
     return q, direction * size[:, None]
 
@@ -55,7 +56,7 @@ def components(array) -> tuple:
 
 
 def truth(case: str, count: int, t: float) -> np.ndarray:
-    """Attitude and rates of the first bodies at time t, as (count, 7, 2): value and remainder."""
+    """Attitude and rates of the first bodies at time t as (count, 7, 2): float64 and remainder."""
     long = "J1" if t == 100 else "J2"
     peers = HERE.parents[1] / "shared" / "peers" / "truth" / f"{long}_{case}.npz"
     if peers.exists():
@@ -89,7 +90,7 @@ def truth(case: str, count: int, t: float) -> np.ndarray:
 
 
 def score(omega, wxyz, exact) -> dict:
-    """Attitude error [rad] and relative rate error, median and worst body."""
+    """Attitude error [rad] and relative rate error, median and maximum over the bodies."""
     count = len(exact)
     q, w = np.stack(wxyz, -1)[:count], np.stack(omega, -1)[:count]
     sign = np.sign((q * exact[:, :4, 0]).sum(-1, keepdims=True))
@@ -111,7 +112,7 @@ def compiled(fn, *given):
 
 
 def timed(fn, repeats: int = 30) -> tuple[float, float]:
-    """Least and median seconds of one call."""
+    """Minimum and median seconds of one call."""
     fn()
     spans = []
     for _ in range(repeats):
@@ -170,7 +171,7 @@ def latency() -> dict:
 
 
 def gradient(count: int, t: float = 100.0) -> dict:
-    """Loss of each body against a target motion; its derivative by the body's own moments."""
+    """Time and error of the derivative of each body's loss with respect to its own moments."""
     q, w = bodies("A", count)
     target = free_motion(
         components(np.broadcast_to(np.array((1.001, 1.998, 3.002)), (count, 3))),
@@ -214,7 +215,7 @@ def gradient(count: int, t: float = 100.0) -> dict:
 
 
 def heyoka_final(case: str, count: int, t: float, tolerance: float) -> dict | None:
-    """The same work by heyoka's Taylor integrator, eight bodies at a time."""
+    """The same final states by heyoka's Taylor integrator, eight bodies at a time."""
     try:
         import heyoka as hy
     except ImportError:

@@ -3,23 +3,24 @@
 python -m benchmarks.fuzz [--scenes 12] [--pairs 40] [--quick] [--seed S] [--parts WORD ...]
     [--lines FILE] [--output FILE]
 
-Moments, rates, gains, orbits and times are drawn over six decades and more
-(``benchmarks/fuzz_parts.py``), forward and backward in time, for bodies alone and in batches. The
-reference (``benchmarks/fuzz_truth.py``) is SciPy's DOP853 at 1e-13, restarted at every switch, of
-equations in plain Python. A motion is left out where a small change grows more than 100 times as
-fast as the angle turned, or where the reference is uncertain. ``error``: the largest angle [rad]
-between the attitudes at the saved times. A result is *kept* within 10 rtol and what rounding
-explains, *flagged* where its status is not SUCCESSFUL, and otherwise *beyond*. Rounding explains
-the larger of 4 eps times the angle turned and eps times its power 1.5 (rounding of the momenta in
-every step; Brouwer, Astron. J. 46, 149, 1937), times the growth of a small change of the rates, in
-single precision also of the moments.
+Moments, rates, gains, orbits and times are drawn over six or more decades
+(``benchmarks/fuzz_parts.py``), forward and backward in time, for single bodies and for batches. The
+reference (``benchmarks/fuzz_truth.py``) is SciPy's DOP853 at 1e-13, restarted at every switch,
+applied to equations in plain Python. A motion is excluded if a small change grows more than 100
+times as fast as the rotation angle, or if the reference is uncertain. ``error``: the largest angle
+[rad] between the attitudes at the saved times. A result is *kept* if its error is at most 10 rtol
+plus the error that rounding explains, *flagged* if its status is not SUCCESSFUL, and otherwise
+*beyond*. Rounding explains the larger of 4 eps times the rotation angle and eps times the angle to
+the power of 1.5 (rounding of the momenta in every step; Brouwer, Astron. J. 46, 149, 1937),
+multiplied by the growth of a small change of the rates, and in single precision also of the
+moments.
 
-Derivatives of a function of the last attitude, by the initial rates, one moment of inertia and one
-gain of the part, in forward and reverse mode, are compared with central differences of the
-reference, by Richardson's extrapolation of two steps.
+Derivatives of a function of the last attitude with respect to the initial rates, one moment of
+inertia and one gain of the part, in forward and reverse mode, are compared with central differences
+of the reference, extrapolated from two steps by Richardson's rule.
 
 ``--parts``: only groups whose names contain one of the words. ``--lines``: a file to which each
-result is appended as it is computed; with it, groups that it already holds are not run again.
+result is appended when it is computed; groups that the file already contains are not run again.
 """
 
 import argparse
@@ -79,7 +80,7 @@ class Case(NamedTuple):
 
 
 def rounded(tree: Any, dtype: str) -> Any:
-    """Numbers as ``dtype`` represents them, in float64."""
+    """Numbers rounded to ``dtype``, returned in float64."""
     if isinstance(tree, dict):
         return {k: rounded(v, dtype) for k, v in tree.items()}
     return np.asarray(tree, dtype).astype(float)
@@ -116,8 +117,11 @@ def _plain(tree: Any) -> Any:
 
 
 class Equations:
-    """Newton's law of a case: state (quaternion, momentum in the body, wheels' axial momenta, and
-    the angle turned)."""
+    """Equations of motion of a case from Newton's law.
+
+    The state is the quaternion, the momentum in the body, the axial momenta of the wheels, and the
+    rotation angle.
+    """
 
     def __init__(self, case: Case):
         self.case, self.parts = case, case.parts
@@ -133,7 +137,7 @@ class Equations:
         self.counts: list[tuple[int, int]] = []
 
     def _inertia(self, t: float) -> tuple[Any, Any]:
-        """Rows of the inertia, and of the inverse of what turns with the body."""
+        """Rows of the inertia, and of the inverse of the inertia without free wheels."""
         tensor = np.diag(self.case.moments)
         for part, n in zip(self.parts, self.numbers):
             found = part.inertia(n, self.case.moments, t)
@@ -219,7 +223,8 @@ class Equations:
 
 class Motion(NamedTuple):
     """The reference at the saved times: attitudes (T, 4), rates (T, 3), wheel speeds (T, m), the
-    angle turned at the end, and the switches."""
+    final rotation angle, and the switches.
+    """
 
     wxyz: np.ndarray
     omega: np.ndarray
@@ -229,7 +234,7 @@ class Motion(NamedTuple):
 
 
 def reference(case: Case, rtol: float = 1e-13, factor: float = 1.0, width: float = 0.25) -> Motion:
-    """Raises ``Failure`` where there is none."""
+    """The reference motion of a case; raises ``Failure`` if there is none."""
     equations = Equations(case)
     begin, end = float(case.ts[0]), float(case.ts[-1])
     sign = 1 if end > begin else -1
@@ -276,7 +281,7 @@ def apart(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def scene_of(parts: tuple[Part, ...], numbers, moments) -> ph.Scene:
-    """The scene of one body, or of a batch where all numbers have a leading axis."""
+    """The scene of one body, or of a batch if all numbers have a leading axis."""
     built = [part.build(n) for part, n in zip(parts, numbers)]
     fields: dict[str, Any] = {}
     for key in ("potential", "torque", "rotors"):
@@ -294,7 +299,7 @@ def typed(tree: Any, dtype: str) -> Any:
 
 
 def stacked(cases: list[Case], dtype: str) -> tuple[ph.Scene, ph.State, np.ndarray]:
-    """The cases as a batch, or the only one without a batch."""
+    """The cases as one batch; a single case has no batch axis."""
 
     def join(*trees):
         if isinstance(trees[0], dict):
@@ -316,7 +321,7 @@ def stacked(cases: list[Case], dtype: str) -> tuple[ph.Scene, ph.State, np.ndarr
 
 
 class Group(NamedTuple):
-    """Cases with one program: the parts, the precision, and whether they stand in a batch."""
+    """Cases of one compiled program: the parts, the precision, and whether they form a batch."""
 
     parts: tuple[Part, ...]
     dtype: str
@@ -331,8 +336,10 @@ class Group(NamedTuple):
 
 
 def judged(case: Case, dtype: str) -> tuple[Motion, float, float] | str:
-    """The reference, the growth of a small change per radian and the uncertainty of the reference
-    [rad]; or why it is left out."""
+    """Reference, growth of a small change per radian, and uncertainty of the reference [rad].
+
+    If the case is excluded, the reason as a string.
+    """
     nudge = 1e-8
     try:
         best = reference(case)
@@ -439,7 +446,7 @@ def results(group: Group, count: int, seed: int, longest: float) -> Iterator[dic
 
 
 def value_of(wxyz: Any, xp: Any) -> Any:
-    """A function of the attitude (4,), of either sign of the quaternion."""
+    """A scalar function of the attitude (4,) that does not depend on the quaternion's sign."""
     w, x, y, z = (wxyz[i] for i in range(4))
     return (
         0.7 * (1 - 2 * (y * y + z * z))
@@ -451,8 +458,11 @@ def value_of(wxyz: Any, xp: Any) -> Any:
 
 
 def changed(case: Case, theta: Any, xp: Any) -> tuple[Any, Any, Any]:
-    """Moments, rates and numbers of a case changed by ``theta`` (5,): rates in units of their size,
-    relative changes of the first moment and of the gain."""
+    """A case whose moments, rates and numbers are changed by ``theta`` (5,).
+
+    The entries are changes of the rates in units of their size, and relative changes of the first
+    moment and of the gain.
+    """
     size = float(np.linalg.norm(case.omega))
     omega = case.omega + size * theta[:3]
     moments = xp.asarray(case.moments) * (1 + xp.asarray([1.0, 0, 0]) * theta[3])
@@ -465,8 +475,9 @@ def changed(case: Case, theta: Any, xp: Any) -> tuple[Any, Any, Any]:
 
 
 def differences(case: Case) -> tuple[np.ndarray, float]:
-    """Derivatives of ``value_of`` by ``theta``, from references, and by how much Richardson's
-    extrapolation has changed them. Raises ``Failure``."""
+    """Derivatives of ``value_of`` with respect to ``theta`` by differences of references, and the
+    change that Richardson's extrapolation made. Raises ``Failure``.
+    """
     step = 1e-3 / case.angle
     counts = set()
 
@@ -612,9 +623,10 @@ def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def slope_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Errors of derivatives over rtol, by rtol, of smooth parts and of parts with switches.
+    """Errors of derivatives over rtol, by rtol, for smooth parts and for parts with switches.
 
-    A derivative that is NaN counts as flagged."""
+    A derivative that is NaN counts as flagged.
+    """
     found = []
     tolerances = [(dtype, rtol) for dtype, rtols in RTOLS.items() for rtol in rtols]
     for smooth, (dtype, rtol) in itertools.product((True, False), tolerances):

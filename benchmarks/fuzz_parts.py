@@ -1,8 +1,8 @@
-"""The public parts of a scene, each with random numbers and with its equations written out anew.
+"""The public parts of a scene, each with random numbers and an independent implementation.
 
-A ``Part`` draws its numbers (``draw``), builds polhode's objects from them (``build``), and has its
-torque, wheels and switches in plain Python after the public docstrings (``torque``, ``wheels``,
-``margins``). Nothing of polhode is called for the equations.
+A ``Part`` draws its numbers (``draw``), builds polhode's objects from them (``build``), and
+implements its torque, wheels and switches in plain Python from the public docstrings (``torque``,
+``wheels``, ``margins``). The equations call nothing of polhode.
 """
 
 import math
@@ -41,7 +41,7 @@ class Scale:
         self.start = 0.0
         self.unit = float(np.mean(self.moments)) * self.rate**2
         self.size = 0.0  # sum of the torques that oscillate with the motion [N m]
-        self.steady = 0.0  # of those that do not
+        self.steady = 0.0  # sum of the other torques [N m]
 
     def decades(self, low: float, high: float) -> float:
         return float(10.0 ** self.rng.uniform(low, high))
@@ -51,7 +51,7 @@ class Scale:
         return v / np.linalg.norm(v)
 
     def torque(self, low: float = -4, high: float = 1, steady: bool = False) -> float:
-        """A size of a torque [N m], which shortens the time simulated."""
+        """Draw the size of a torque [N m]; a larger torque shortens the simulated time."""
         found = self.unit * self.decades(low, high)
         if steady:
             self.steady += found
@@ -61,7 +61,7 @@ class Scale:
 
     @property
     def span(self) -> float:
-        """Time [s] in which the body turns by about the angle."""
+        """Time [s] in which the body rotates by about ``angle``."""
         least = float(np.min(self.moments))
         fast = math.sqrt(self.rate**2 + self.size / least)
         push = self.steady / least
@@ -73,7 +73,7 @@ class Scale:
         return float(np.min(self.moments)) * self.rate * self.decades(low, high)
 
     def orbit(self, kind: str, low: float = -2, high: float = 0.0) -> dict[str, Any]:
-        """Elements of an orbit of a mean motion within decades of the rate."""
+        """Draw the elements of an orbit whose mean motion is within decades of the rate."""
         n = self.rate * self.decades(low, high)
         a = self.decades(3, 9)
         found: dict[str, Any] = {"mu": n * n * a**3, "a": a}
@@ -91,7 +91,7 @@ class Scale:
 
 
 class Moment(NamedTuple):
-    """What the equations of a part see at a time."""
+    """The time and state at which the equations of a part are evaluated."""
 
     t: float
     q: Any
@@ -104,8 +104,10 @@ class Moment(NamedTuple):
 
 
 class Wheel(NamedTuple):
-    """axis, moment, initial relative speed; ``motor(moment, speed, speeds, levels)`` or None where
-    the speed is held."""
+    """Axis, moment of inertia, initial relative speed, and torque of the motor of a wheel.
+
+    ``motor(moment, speed, speeds, levels)`` is None if the speed is constant.
+    """
 
     axis: Any
     inertia: float
@@ -114,7 +116,7 @@ class Wheel(NamedTuple):
 
 
 class Part:
-    """Base of the parts; ``gain``: the number by which derivatives are taken."""
+    """Base class of the parts; ``gain``: the number with respect to which derivatives are taken."""
 
     name = ""
     gain = ""
@@ -148,7 +150,7 @@ class Part:
         return []
 
     def at_edge(self, n, m: Moment) -> None:
-        """Called at the start and at every edge, with ``m.held`` to change."""
+        """Called at the start and at every edge in time; may change ``m.held``."""
 
     def inertia(self, n, moments, t: float) -> Any:
         return None
@@ -170,7 +172,7 @@ def flyby_of(o) -> Any:
 
 
 def plane(o, x: float, y: float) -> tuple[float, float, float]:
-    """Of components along the node and across it in the plane of the orbit."""
+    """Space components of a vector in the plane of the orbit: x along the node, y normal to it."""
     ci, si = math.cos(o["inclination"]), math.sin(o["inclination"])
     cn, sn = math.cos(o["node"]), math.sin(o["node"])
     return cn * x - sn * ci * y, sn * x + cn * ci * y, si * y
@@ -385,7 +387,7 @@ class SpaceSine(BodySine):
 
 @cache
 def _slopes(times, values) -> np.ndarray:
-    """Derivatives at the knots of the polynomials through the five knots around each."""
+    """Derivatives at the knots: those of the polynomials through the five nearest knots."""
     found = []
     for k in range(len(times)):
         first = int(np.clip(k - 2, 0, len(times) - 5))
@@ -410,7 +412,7 @@ class TableTorque(Part):
         size = s.torque(-4, 0)
         gaps = s.rng.uniform(0.2, 1, self.knots - 1)
         times = np.concatenate([[0.0], np.cumsum(gaps)])
-        # a little longer than the time simulated on both sides, which the sign of it decides later
+        # longer than the simulated span in both directions: the sign of time is drawn later
         times = s.start + (times / times[-1] * 2.2 - 1.1) * s.span
         found = {"times": times, "values": size * s.rng.normal(size=(self.knots, 3))}
         if self.slopes:
@@ -426,7 +428,7 @@ class TableTorque(Part):
 
     def torque(self, n, m, levels):
         times = np.asarray(n["times"])
-        # within an interval, whichever way the step goes: its middle decides
+        # the interval of the step, forward or backward in time, from the middle of the step
         middle = m.held.get("middle", m.t)
         i = int(np.clip(np.searchsorted(times, middle, side="right") - 1, 0, len(times) - 2))
         h = times[i + 1] - times[i]
@@ -797,7 +799,7 @@ class Sampled(Part):
     exclusive = ("pulses",)
 
     def draw(self, s):
-        # 20.5 periods of two seconds, whatever the numbers: the period is part of the program
+        # always 20.5 periods of two seconds: the period is a constant of the program
         s.angle = 20.5 * 2.0 * s.rate
         return {"k": s.damping(-2, -0.3), "kp": s.unit * s.decades(-2, 0)}
 
@@ -866,7 +868,7 @@ class AirDrag(Part):
 
 class Light(Part):
     name, gain, smooth = "SolarPressure, Eclipse", "pressure", False
-    batched = False  # numbers of each body would be those of the plates
+    batched = False  # the leading axis of the numbers is that of the plates
 
     def draw(self, s):
         found = _box(s)
@@ -1332,11 +1334,11 @@ PARTS: list[Part] = [
     Tensor(),
     Breathing(),
 ]
-"""All of them."""
+"""All parts."""
 
 
 def fits(parts: tuple[Part, ...]) -> bool:
-    """Whether a scene can hold these together."""
+    """Whether these parts can be combined in one scene."""
     marks = [mark for part in parts for mark in part.exclusive]
     if len(marks) != len(set(marks)):
         return False

@@ -1,9 +1,9 @@
-"""Reference motions with switches: SciPy's DOP853, restarted wherever the equations kink or jump.
+"""Reference motions with switches: SciPy's DOP853, restarted at every kink or jump of the field.
 
-The equations are ``field(t, y, levels)`` with the margins ``margins(t, y)``: a level is whether its
-margin is positive, and with all levels held the field is smooth. Each step is searched for changes
-of sign, and between samples for extrema that reach zero; the root is polished by a step of full
-accuracy that ends there.
+The equations are ``field(t, y, levels)`` with ``margins(t, y)``. A level states whether its margin
+is positive; for constant levels the field is smooth. Each step is searched for sign changes of the
+margins, also for those between samples, where an extremum crosses zero. The step is then repeated
+at full accuracy up to the root.
 """
 
 import math
@@ -15,11 +15,11 @@ from scipy.integrate import DOP853
 from scipy.optimize import brentq, minimize_scalar
 
 SAMPLES = 8
-"""Of the margins within a step."""
+"""Number of samples of the margins within a step, to find sign changes."""
 
 
 class Failure(Exception):
-    """A motion that has no reference: it slides along a switch, diverges or takes too long."""
+    """A motion without a reference: it slides along a switch, diverges or takes too long."""
 
 
 class Reference:
@@ -43,12 +43,12 @@ class Reference:
         self.switches: list[tuple[float, int]] = []
 
     def levels(self, t: float, y: np.ndarray) -> list[bool]:
-        """At a point."""
+        """Levels at a point."""
         found = np.asarray(self.margins(t, y), float)
         return [bool(g > 0) for g in found]
 
     def run(self, t: float, y: np.ndarray, end: float, levels: list[bool]) -> np.ndarray:
-        """The state at ``end``; ``levels`` are updated."""
+        """The state at ``end``; ``levels`` are updated in place."""
         y, again = np.asarray(y, float), 0
         while t != end:
             begin = t
@@ -108,7 +108,7 @@ class Reference:
         return end, solver.y, []
 
     def _polished(self, t, y, levels, which) -> tuple[float, np.ndarray]:
-        """One step of Newton's rule to the root of the first margin."""
+        """One Newton step to the root of the first margin."""
         rate = self.field(t, y, levels)
         h = 1e-6 * self.longest
         g, after, before = (self.margins(t + s, y + s * rate)[which[0]] for s in (0.0, h, -h))
@@ -120,7 +120,7 @@ class Reference:
         return t, y
 
     def _first(self, solver: DOP853, levels) -> tuple[float, list[int]] | None:
-        """Place and numbers of the first margins of the step that change sign."""
+        """Time and indices of the margins that change sign first within the step."""
         dense = solver.dense_output()
         begin, width = solver.t_old, solver.t - solver.t_old
 
@@ -137,7 +137,7 @@ class Reference:
             scale = np.max(np.abs(g))
             if scale == 0:
                 continue
-            if g[0] <= 1e-9 * scale:  # just turned: which side the motion is on shows a little on
+            if g[0] <= 1e-9 * scale:  # a root at the start: sample slightly later for the sign
                 low = 1e-7
                 if value(low)[k] < 0:
                     roots.append((0.0, k))
@@ -154,7 +154,7 @@ class Reference:
                     root = self._dip(value, k, places[i - 1 : i + 2], low)
                     if root is not None:
                         break
-            # an extremum between a sample and the end next to it
+            # an extremum in the first or last interval is not enclosed by three samples
             if root is None and g[-1] < g[-2] and value(1 - 1e-4)[k] < g[-1]:
                 root = self._dip(value, k, (places[-2], 0, places[-1]), low)
             if root is None and g[1] > g[0] and value(low + 1e-4)[k] < value(low)[k]:
@@ -167,7 +167,7 @@ class Reference:
         return begin + first * width, [k for x, k in roots if x - first <= 1e-13]
 
     def _dip(self, value, k, bounds, low) -> float | None:
-        """First root of a margin that is positive at both bounds, if it has one between."""
+        """First root of a margin that is positive at both bounds; None if there is none."""
         a, b = max(bounds[0], low), bounds[-1]
         found: Any = minimize_scalar(
             lambda x: value(x)[k], bounds=(a, b), method="bounded", options={"xatol": 1e-9}
@@ -180,7 +180,7 @@ class Reference:
         return root
 
 
-# Vectors in tuples: a field of plain numbers is several times faster than one of small arrays.
+# Vectors are tuples: scalar arithmetic is several times faster than NumPy on small arrays.
 
 Vector = Any
 
@@ -231,8 +231,9 @@ def to_body(rows: Vector, v: Vector) -> tuple[float, float, float]:
 
 
 def anomaly(mean: float, e: float) -> float:
-    """Eccentric anomaly of an ellipse, hyperbolic anomaly for e > 1; by Newton's rule in a
-    bracket."""
+    """Eccentric anomaly of an ellipse, hyperbolic anomaly for e > 1, by Newton's method within a
+    bracket.
+    """
     if e < 1:
         whole = 2 * math.pi * round(mean / (2 * math.pi))
         m = mean - whole

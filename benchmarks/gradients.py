@@ -1,12 +1,12 @@
-"""The cost and the error of gradients: reverse mode by the three moments of every body.
+"""Time and error of gradients: reverse mode with respect to the three moments of every body.
 
     python -m benchmarks.gradients [FAMILY ...] [--quick] [--output out/gradients.json]
 
-A fixed linear function of the final attitude and rates is differentiated with respect to the
-moments of inertia of each body, to t = 20, on one core. Beside the time: that of the value alone,
-memory of the compiled programs, and the error against derivatives of 40-digit solutions
-(benchmarks/truth.py). Peers: diffrax in reverse mode, heyoka's variational equations (forward mode
-in three parameters, which gives the same numbers).
+A fixed linear function of the attitude and rates at t = 20 is differentiated with respect to the
+moments of inertia of each body, on one core. Further columns contain the time of the value alone,
+the memory of the compiled programs, and the error against derivatives of 40-digit solutions
+(benchmarks/truth.py). Other programs: diffrax in reverse mode, and heyoka's variational equations
+(forward mode in three parameters, which computes the same numbers).
 """
 
 import argparse
@@ -49,14 +49,15 @@ RTOLS = (1e-6, 1e-9)
 
 
 def loss(wxyz, omega):
-    """Weighted sum over components, of all bodies."""
+    """Weighted sum over the components and over all bodies."""
     return sum(w * jnp.sum(x) for w, x in zip(WEIGHTS, (*wxyz, *omega)))
 
 
 def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
-    """Value of polhode's default as a function of the moments (n, k) and the method's name.
+    """Loss by polhode's default as a function of the moments, the moments (n, k), and a label.
 
-    ``by``: or of the ``state`` (n, 7), or of the ``weight`` of each heavy top (n, 1).
+    ``by``: "state" or "weight" for a function of the state (n, 7), or of the weight of each heavy
+    top (n, 1), instead of the moments.
     """
     wxyz, omega = (jnp.asarray(x) for x in problem.states(n))
     state, ts = ph.State(wxyz, omega), jnp.array([0.0, problem.horizon])
@@ -110,7 +111,7 @@ def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
 
 
 def stock(problem: Problem, n: int, tolerance: float, chunk: int = 40):
-    """The same by diffrax's Dopri8 in chunks of bodies, moments (n, 3)."""
+    """The same loss by diffrax's Dopri8 in chunks of bodies, by the moments (n, 3)."""
     import diffrax
 
     start = jnp.asarray(np.concatenate(problem.states(n), axis=1))
@@ -144,7 +145,7 @@ def stock(problem: Problem, n: int, tolerance: float, chunk: int = 40):
 
 
 def measure_jax(peer, made, problem, n, setting, exact) -> dict:
-    """One row from a value function."""
+    """One row for a value function: times, memory and error."""
     value, moments, name = made
     compile_s, programs = [], []
     for function in (value, jax.value_and_grad(value)):
@@ -191,7 +192,7 @@ def _row(problem, peer, name, n, setting, found, exact, walls, ran) -> dict:
 
 
 def _memory(program) -> float | None:
-    """Arguments, results and temporaries of a compiled program [MB]."""
+    """Memory of a compiled program [MB]: arguments, results and temporaries."""
     about = program.memory_analysis()
     if about is None:
         return None
@@ -200,7 +201,7 @@ def _memory(program) -> float | None:
 
 
 def variational(problem: Problem, n: int, tolerance: float, exact) -> dict:
-    """heyoka's first-order variational equations by the three moments."""
+    """One row: heyoka's first-order variational equations with respect to the three moments."""
     import heyoka as hy
 
     names = hy.make_vars("q0", "q1", "q2", "q3", "x", "y", "z")

@@ -1,16 +1,16 @@
-"""Fitting the inertia of free bodies: errors against the Cramer-Rao bound, times against SciPy.
+"""Fits of the inertia of free bodies: errors against the Cramer-Rao bound, times against SciPy.
 
-Designs: 400 bodies each, several lengths and noises; the error of all entries of the tensor in
-the metric of their information (1 is the bound), cover of 95 % intervals with the standard error
-of that number (the two ratios of a body count as one draw), what did not converge; the designs
-apart and pooled.
-Speed: one recording of 1,000 samples from raw rates to covariance, beside SciPy's ``least_squares``
-over ``solve_ivp`` (DOP853, log-Cholesky unknowns, the same start), errors of both; and 1,000
-bodies in one call. Data come from DOP853 at 1e-11. Single thread, one core.
+Designs: 400 bodies each, with several lengths and noise levels. The rows contain the error of all
+entries of the tensor in the metric of the information matrix (1 is the bound), the coverage of the
+95 % intervals with its standard error (the two ratios of a body count as one draw), and the number
+of fits that did not converge; for each design and for all of them together. Speed: one recording of
+1,000 samples from raw rates to covariance, compared with SciPy's ``least_squares`` over
+``solve_ivp`` (DOP853, log-Cholesky unknowns, the same start), with the errors of both; and 1,000
+bodies in one call. Data are simulated by DOP853 at 1e-11. Single thread, one core.
 
     python -m benchmarks.identification [--quick] [--part designs | speed] [--output FILE]
 
-A part run alone keeps what the file holds of the other.
+If one part is run, the other part of an existing file is retained.
 """
 
 import argparse
@@ -53,7 +53,7 @@ jax.config.update("jax_enable_x64", True)
 RATE = 6.0
 # the simulated sensors have no errors of scale or alignment
 EXACT = FitOptions(gyroscope=Gyroscope.ideal())
-# seed, turns, samples, noise over rate, smallest second moment over the largest
+# seed, revolutions, samples, noise over rate, smallest over largest second moment
 DESIGNS = (
     (1, 4, 80, 0.002, 0.2),
     (2, 4, 80, 0.01, 0.2),
@@ -134,7 +134,7 @@ def design(seed, turns, samples, noise, least, count):
 
 
 def summary(square, inside):
-    """Error over bound and cover, each with its standard error; bodies are independent."""
+    """Error over bound, and coverage, each with its standard error over independent bodies."""
     error = np.sqrt(square.mean() / 5)
     covered = inside.mean(axis=1)
     root = np.sqrt(len(square))
@@ -147,7 +147,7 @@ def summary(square, inside):
 
 
 def best(call, repeats):
-    """Shortest of several runs, s, and the last result."""
+    """Minimum time of several runs [s], and the last result."""
     shortest = np.inf
     for _ in range(repeats):
         begin = time.perf_counter()
@@ -157,7 +157,9 @@ def best(call, repeats):
 
 
 def start_of(times, rates):
-    """Where both begin: the regression's second moments by an upper triangle, and the rates."""
+    """Common start of both fits: a triangular factor of the regression's second moments, and the
+    rates.
+    """
     sigma = np.asarray(regression(rates[None], times[None], np.ones((1, len(times))))[0])
     turned = np.linalg.cholesky(sigma[::-1, ::-1])[::-1, ::-1]
     _, b, c = np.diagonal(turned) / turned[0, 0]
@@ -166,7 +168,7 @@ def start_of(times, rates):
 
 
 def with_scipy(times, rates, start):
-    """The usual script: second moments by a triangular factor, a solver inside the residuals."""
+    """A typical SciPy fit: triangular factor of the second moments, solver within the residuals."""
 
     def tensor(y):
         factor = np.array([[1, y[2], y[3]], [0, np.exp(y[0]), y[4]], [0, 0, np.exp(y[1])]])
@@ -252,9 +254,10 @@ def speed(count, quick):
 
 
 def gradient():
-    """Largest error of the residuals' derivatives by moments and rates, relative to each column.
+    """Largest error of the derivatives of the residuals with respect to moments and rates, relative
+    to each column.
 
-    Against central differences (step 2^-26) of residuals with 50 digits.
+    The reference is central differences (step 2^-26) of residuals computed with 50 digits.
     """
     moments, omega = np.array([1.1, 1.5, 1.8]), np.array([0.8125, 2.0, -1.125])
     times = np.array([0.0, 0.4, 1.1, 2.5])

@@ -1,8 +1,8 @@
-"""Time from a new process to the names of a scene, beside the libraries that polhode builds on.
+"""Time of a new process to import the names of a scene, compared with the underlying libraries.
 
     python -m benchmarks.imports [--runs 7] [--output out/imports.json]
 
-Least wall time of each import over the runs, alternated; compare within one run only.
+Minimum wall time of each import over alternating runs; compare times of one run only.
 """
 
 import argparse
@@ -27,7 +27,7 @@ PROGRAMS = {
 
 
 def measure(programs: dict[str, str], runs: int) -> list[dict]:
-    """Least seconds of a new process for each program."""
+    """Minimum seconds of a new process for each program."""
     _report.compile_package()
     least = dict.fromkeys(programs, float("inf"))
     for _ in range(runs):

@@ -1,14 +1,14 @@
-"""Work-precision of the integrators on heavy tops, beside heyoka and stock diffrax.
+"""Work-precision of the integrators on heavy tops, compared with heyoka and diffrax.
 
     python -m benchmarks.integrators [--quick] [--output out/integrators.json]
 
-Two heavy tops about a fixed point (mass 1, g = 2, centre of mass 0.5 along body z): a fast
-Lagrange top, I = (1, 1, 0.5), and an asymmetric one, I = (1, 1.5, 2), some of whose bodies are
-chaotic; and the free asymmetric body (1, 2, 3). "simulate" is the whole of ``ph.simulate`` with the
-planner's extrapolation; "Extrapolation" a bare diffrax solve of a field written by hand. Random
-attitudes and rates, horizon 100 s. Truth is ../shared/peers/truth where present, else a 30-digit
-Taylor series made and cached here. All programs are timed in turn in one process; ratios to heyoka
-are the robust numbers.
+Two heavy tops about a fixed point (mass 1, g = 2, centre of mass 0.5 along body z): a fast Lagrange
+top, I = (1, 1, 0.5), and an asymmetric one, I = (1, 1.5, 2), some of whose bodies are chaotic; and
+the free asymmetric body (1, 2, 3). "simulate" is an entire call of ``ph.simulate`` with the
+extrapolation that it chooses; "Extrapolation" is only a diffrax solve of a field written by hand.
+Attitudes and rates are random, the horizon is 100 s. The reference is ../shared/peers/truth if
+present, otherwise a 30-digit Taylor series that is computed and cached here. All programs are timed
+alternately in one process; ratios to heyoka are more robust than times.
 """
 
 import argparse
@@ -41,7 +41,7 @@ CASES = {
 
 
 def heavy_top(t, y, parameters):
-    """Lie-Poisson field of a heavy top with its centre of mass on body z, on components."""
+    """Lie-Poisson field of a heavy top with its centre of mass on body z, by components."""
     inverse, strength = parameters
     momentum, (w, x, y_, z) = y
     a, b, c = (m * i for m, i in zip(momentum, inverse))
@@ -61,7 +61,8 @@ def heavy_top(t, y, parameters):
 def taylor_truth(moments, strength, wxyz, omega, times, digits=30):
     """States (wxyz, omega_body) at ``times`` of one heavy top, by Taylor series in mpmath.
 
-    The last two terms decide the step: they stay below ``10^-digits``. Floats are taken exactly.
+    The step is chosen such that the last two terms are below ``10^-digits``. Floats are treated as
+    exact.
     """
     with mpmath.workdps(digits + 8):
         i1, i2, i3 = (mpmath.mpf(i) for i in moments)
@@ -109,7 +110,7 @@ def _series(state, k, g, order):
 
 
 def initial_states(case, n):
-    """Attitudes uniform on the sphere, rates isotropic with length uniform in [1, 2) plus spin."""
+    """Attitudes uniform on SO(3), rates isotropic with length uniform in [1, 2) plus spin."""
     _, spin, _, seed, _ = CASES[case]
     draws = np.random.Generator(np.random.PCG64(seed)).standard_normal((n, 8))
     wxyz = draws[:, :4] / np.linalg.norm(draws[:, :4], axis=1, keepdims=True)
@@ -119,7 +120,7 @@ def initial_states(case, n):
 
 
 def truth(case, cache: Path, bodies=16):
-    """Final attitudes of the first bodies, as two summed float64 arrays (n, 4)."""
+    """Final attitudes of the first bodies, each as an unevaluated sum of two float64 (n, 4)."""
     moments, _, strength, _, name = CASES[case]
     shared = Path(__file__).resolve().parents[2] / "shared/peers/truth" / f"{name}.npz"
     if shared.exists():
@@ -138,7 +139,7 @@ def truth(case, cache: Path, bodies=16):
 
 
 def attitude_errors(wxyz, exact):
-    """Angle [rad] between attitudes (n, 4) and the truth, without cancellation."""
+    """Angle [rad] between attitudes (n, 4) and the reference, without cancellation."""
     high, low = exact
     n = min(len(wxyz), len(high))
     q = wxyz[:n] / np.linalg.norm(wxyz[:n], axis=1, keepdims=True)
@@ -148,7 +149,7 @@ def attitude_errors(wxyz, exact):
 
 
 class Polhode:
-    """One solver on a batch, lanes of a whole diffrax solve."""
+    """A diffrax solve with one solver, in which the bodies of a batch share the steps."""
 
     def __init__(self, case, n, solver, steps, controller=None, label=None):
         moments, _, strength, _, _ = CASES[case]
@@ -188,7 +189,7 @@ class Polhode:
 
 
 class Simulated:
-    """``ph.simulate`` as the planner runs it on a general body, final state only."""
+    """``ph.simulate`` with the method for a general body, final state only."""
 
     def __init__(self, case, n, rtol, dtype=jnp.float64):
         moments, _, strength, _, _ = CASES[case]
@@ -216,7 +217,7 @@ def weight_of(strength):
 
 
 def stepped(scene, state, ts, rtol):
-    """The planner's integrator, also where it would know the exact motion."""
+    """The integrator that ``ph.simulate`` chooses, even if the scene has a closed form."""
     general = ph.Scene(ph.Inertia.from_moments(jnp.array([1.0, 1.5, 2.0])), scene.potential)
     return ph.explain(general, state, ts, rtol=rtol).method
 
@@ -269,7 +270,7 @@ class Heyoka:
 
 
 def measure(programs, case, n, exact, repeats):
-    """Rows with time and error; the programs take turns, the fastest of the repeats counts."""
+    """Rows with time and error; the programs run alternately, and the minimum of repeats counts."""
     outputs = [p() for p in programs]
     best = [math.inf] * len(programs)
     for _ in range(repeats):
@@ -302,7 +303,7 @@ def measure(programs, case, n, exact, repeats):
 
 
 def marched(case, n, rtol):
-    """The planner's solver under the same error control, on the field written by hand."""
+    """polhode's solver with the same error control, applied to the field written by hand."""
     solver = ph.Extrapolation(None, accuracy=Accuracy(rtol, HORIZON))
     whole = diffrax.StepTo(jnp.array([0.0, HORIZON]))
     return Polhode(case, n, solver, None, whole, f"Extrapolation {rtol:.0e}")

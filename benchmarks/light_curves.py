@@ -1,13 +1,18 @@
-"""How often the tumbling body is found from its light curve alone, and how fast trials are.
+"""How often a tumbling body is identified from its light curve, and the time of a trial.
 
-Synthetic tumblers: ellipsoids whose inertia is not quite that of their shape, in both modes, seen
-on nights of 6 hours with gaps for a month of a circular orbit, with noise and an offset for every
-night. Every case is one of: right (the best solution has the right mode and both periods to 0.1 %);
-within its errors (to three of its standard deviations, which are larger than that); listed (not
-the best, but one of the solutions listed beside it with odds above 1 in 1000); told (wrong, and a
-note says that it may be); silent (wrong without a warning). The search was developed on seeds 0 to
-257: others count. ``--egg``: bodies that are no ellipsoids. ``--real FOLDER`` adds 2012 TC4 and
-Toutatis, the latter with ``--seeds`` of the search, from files described in docs/light_curves.md.
+The synthetic tumblers are ellipsoids whose inertia differs slightly from that of their shape, in
+both modes. They are observed during nights of 6 hours with gaps, for a month of a circular orbit,
+with noise and an offset for every night. Each case has one of these outcomes:
+
+- right: the best solution has the right mode and both periods to 0.1 %;
+- within its errors: right to three of the stated standard deviations, if these are larger;
+- listed: not the best solution, but one in the list with odds above 1 in 1000;
+- told: wrong, and a note says that it may be wrong;
+- silent: wrong without a warning.
+
+The search was developed on seeds 0 to 257; only other seeds are valid tests. ``--egg``: bodies that
+are not ellipsoids. ``--real FOLDER`` adds 2012 TC4 and Toutatis, the latter with ``--seeds`` seeds
+of the search, from the files that ``real`` reads.
 
     python -m benchmarks.light_curves [--first 258] [--count 50] [--noise 0.02 0.1] [--egg 5]
         [--real FOLDER] [--speed]
@@ -38,12 +43,12 @@ from polhode.lightcurve import _brightness, _fit, _frequencies, _least_squares, 
 _magnitudes = jax.jit(_brightness.magnitudes, static_argnums=0)
 
 VERDICTS = ("right", "within its errors", "listed", "told", "silent")
-HIGHEST = 7.0  # frequency sought of synthetic tumblers [1/d]
+HIGHEST = 7.0  # end of the frequency search for synthetic tumblers [1/d]
 TOUTATIS = {"P_phi": (7.41, 0.1), "P_psi": (5.38, 0.05), "pole": (180.2, -54.75)}
 
 
 def directions(jd, lean=0.1):
-    """Vectors to Sun and observer [au] of a body at 1.8 au, the observer at 1 au; circles."""
+    """Vectors [au] to Sun and observer, of a body at 1.8 au and an observer at 1 au on circles."""
 
     def circle(radius, longitude, tilt):
         return radius * np.stack(
@@ -56,15 +61,16 @@ def directions(jd, lean=0.1):
 
 
 def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=0.02, egg=False):
-    """A light curve and the truth behind it: P_phi, P_psi [day], mode, pole, and the body.
+    """A light curve, its truth (P_phi, P_psi [day], mode, pole), and the body.
 
-    ``each`` point of a night stands for 15 minutes; above 0.05 mag it is the mean of five.
-    ``egg``: the body is `blunt`, no ellipsoid, and its moments are those of a homogeneous one.
+    ``each`` point of a night represents 15 minutes; above 0.05 mag of noise it is the mean of five
+    measurements. ``egg``: the shape is `blunt` instead of an ellipsoid, and the moments are those
+    of the homogeneous body.
     """
     rng = np.random.default_rng(seed)
     several = 5 if noise > 0.05 else 1
     each = each * several
-    # two observatories, 8 hours apart, take turns; a tenth of the points are lost to clouds
+    # two observatories, 8 hours apart, alternate; clouds remove a tenth of the points
     start = np.sort(rng.choice(int(days), nights, replace=False)) + rng.uniform(-0.05, 0.05, nights)
     start[0], start[-1] = 0.0, days
     start += np.where(rng.uniform(size=nights) < 0.5, 0, 1 / 3)
@@ -91,7 +97,7 @@ def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=
         P_psi, mode = float(found.P_psi) / scale, int(found.mode)
         nutation = float(found.theta_max - found.theta_min)
         wide = float(found.theta_max) > 0.25 if mode == 0 else nutation > 0.35
-        # twenty turns at least, and not within 0.1 % of a spin about one axis
+        # at least twenty revolutions, and not within 0.1 % of a permanent rotation
         if wide and 2 / P_phi + 2 / P_psi < 7 and P_psi < days / 20:
             break
     bodies = _brightness.Bodies(
@@ -123,10 +129,10 @@ def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=
 
 
 def blunt(axes, blunting=3.0, taper=0.25):
-    """Moments (3,), vertices and faces of a convex body, in its principal axes.
+    """Moments (3,), vertices and faces of a convex body in its principal axes.
 
-    A superellipsoid with exponent ``blunting``, one end thicker than the other: projected by
-    x -> x / (1 + taper x), under which convex bodies stay convex.
+    It is a superellipsoid with exponent ``blunting`` with one end thicker than the other: it is
+    transformed by x -> x / (1 + taper x), a projective map that preserves convexity.
     """
     turn = np.linspace(0, 2 * np.pi, 49)[:-1]
     rise = np.linspace(-np.pi / 2, np.pi / 2, 25)[1:-1, None]
@@ -141,7 +147,7 @@ def blunt(axes, blunting=3.0, taper=0.25):
     outward = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) > 0
     faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
     tensor = ph.MassProperties.from_mesh(vertices, faces, density=1.0).inertia.tensor
-    moments = np.diag(np.asarray(tensor))  # its planes of symmetry are those of the axes
+    moments = np.diag(np.asarray(tensor))  # diagonal: the coordinate planes are planes of symmetry
     return moments, vertices, faces
 
 
@@ -158,7 +164,7 @@ def apart(a, b) -> float:
 
 
 def _right(solution, truth, tolerance=1e-3, sigmas=0.0) -> bool:
-    """Mode and both periods, to ``tolerance`` or ``sigmas`` of the errors stated."""
+    """Whether mode and both periods agree, to ``tolerance`` or to ``sigmas`` stated errors."""
     return int(solution.mode) == truth["mode"] and all(
         abs(period / truth[name] - 1) < max(tolerance, sigmas * error / period)
         for name, period, error in (
@@ -169,7 +175,7 @@ def _right(solution, truth, tolerance=1e-3, sigmas=0.0) -> bool:
 
 
 def _verdict(fit, truth) -> str:
-    """See the top of the file."""
+    """Outcome of a case, as defined in the docstring of the module."""
     if _right(fit.best, truth):
         return "right"
     if _right(fit.best, truth, sigmas=3.0):
@@ -181,10 +187,10 @@ def _verdict(fit, truth) -> str:
 
 
 def case(seed: int, noise: float, egg: bool = False, **options) -> dict:
-    """One synthetic tumbler: was it found, where in the list, how far off."""
+    """Fit one synthetic tumbler: outcome, place in the list, and errors."""
     curve, truth, body = synthetic(seed, noise, egg=egg)
     began = time.process_time()
-    # ellipsoids: their cost is compared with that of a fit that starts at the truth
+    # no convex shapes: the cost is compared with that of an ellipsoid fitted from the truth
     fit = lightcurve.fit_light_curve(
         curve, floor=0.01, max_frequency=HIGHEST, convex=False, **options
     )
@@ -216,9 +222,10 @@ def case(seed: int, noise: float, egg: bool = False, **options) -> dict:
 
 
 def best_possible(curve, body, learnt=None, floor=0.01, spread=0.02) -> dict:
-    """What a fit started at the truth ends with: errors of the periods, relative, and robust cost.
+    """Relative errors of the periods and robust cost of a fit that starts at the truth.
 
-    The errors with the nights' ``spread`` known, the cost with the one ``learnt``.
+    The errors are computed with the known ``spread`` of the nights' offsets, the cost with the
+    estimated one (``learnt``).
     """
     phase, width = lightcurve.HG1G2(), np.full(_least_squares.BATCH, 3.0)
     problem = _least_squares.Problem(phase, curve.points(floor, spread))
@@ -236,7 +243,10 @@ def best_possible(curve, body, learnt=None, floor=0.01, spread=0.02) -> dict:
 
 
 def summary(cases, noise: float) -> dict:
-    """Counts of one noise; ``determined``: the points allow 0.1 % in both periods at 3 sigma."""
+    """Counts of the outcomes at one noise level.
+
+    ``determined``: only cases whose data determine both periods to 0.1 % at three sigma.
+    """
     rows = [r for r in cases if r["noise"] == noise]
     sharp = [
         r for r in rows if 3 * max(r["possible"]["P_phi_std"], r["possible"]["P_psi_std"]) < 1e-3
@@ -256,7 +266,7 @@ def summary(cases, noise: float) -> dict:
 
 
 def speed(states: int = 100_000, samples: int = 400) -> dict:
-    """Seconds to score trial states, compiled before."""
+    """Time [s] to score trial states, without compilation."""
     curve, *_ = synthetic(0, 0.02)
     keep = np.linspace(0, curve.t.size - 1, samples - samples % 128).astype(int)
     sun, observer = directions(np.sort(curve.t[keep]))
@@ -300,9 +310,10 @@ def toutatis(folder: Path):
 
 
 def radar(folder: Path, solution, start: float, until=2449000.0 + 365) -> list[float]:
-    """Angles [deg] between a solution's attitudes and those by radar, over the body's symmetries.
+    """Angles [deg] between a solution's attitudes and those by radar.
 
-    An ellipsoid's light does not tell its half turns apart: the one of the four that fits best.
+    The light of an ellipsoid is the same after half turns about its axes: of the four equivalent
+    attitudes the one that fits best is used.
     """
     lines = (folder / "toutatis_radar_epochs.csv").read_text().splitlines()
     table = list(csv.DictReader(x for x in lines if not x.startswith("#")))
@@ -326,7 +337,7 @@ def radar(folder: Path, solution, start: float, until=2449000.0 + 365) -> list[f
 
 
 def _passive(alpha, beta, gamma):
-    """R3(gamma) R1(beta) R3(alpha), space -> body."""
+    """The matrix R3(gamma) R1(beta) R3(alpha), space -> body."""
 
     def about(axis, angle):
         c, s = np.cos(angle), np.sin(angle)
@@ -338,7 +349,7 @@ def _passive(alpha, beta, gamma):
 
 
 def real(folder: Path, seeds: int, **options) -> dict:
-    """2012 TC4 and Toutatis."""
+    """Fit 2012 TC4 and Toutatis."""
     tc4 = lightcurve.fit_light_curve(
         lightcurve.read_light_curve(folder / "tc4_2012.csv", folder / "tc4_2012_vectors.csv"),
         **options,
@@ -394,7 +405,7 @@ def main() -> None:
     result: dict = {}
 
     def keep(name, value):
-        """A long study may be read while it runs."""
+        """Write the file after each case, so that a long run can be read before it ends."""
         result[name] = value
         return write("light_curves", result, path=given.output)
 

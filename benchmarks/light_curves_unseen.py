@@ -1,18 +1,19 @@
-"""Verdicts on light curves of bodies that the fit's model does not contain.
+"""Verdicts on light curves of bodies that the model of the fit does not contain.
 
 Bodies are convex polyhedra: hulls of 12 to 60 random points near an ellipsoid, whose moments of
-inertia differ by up to 4 % from those of a homogeneous interior. Their motion comes from SciPy's
-Jacobi elliptic functions and a Fourier series of the precession rate; their light is a sum over
-facets by a mixture of the Lommel-Seeliger and Lambert laws, with a phase function of its own. No
-function of the package takes part in making a light curve.
+inertia differ by up to 4 % from those of a homogeneous interior. Their motion is computed from
+SciPy's Jacobi elliptic functions and a Fourier series of the precession rate; their brightness is a
+sum over facets with a mixture of the Lommel-Seeliger and Lambert laws and a phase function. The
+light curves are computed without any function of the package.
 
 Of every 14 curves 10 are tumblers (P_phi 2 to 30 h, both modes), 2 rotate about their short axis,
-1 is noise alone, 1 is a tumbler with 12 to 34 points. Each is seen on 10 to 20 nights of 15 to 60
-days from one or two observatories, with 2 to 5 % noise of which a part is correlated over half an
-hour, zero points of nights that differ by 0.03 mag, and gaps by clouds. Two thirds are calibrated.
+1 is noise alone, 1 is a tumbler with 12 to 34 points. Each is observed in 10 to 20 nights within 15
+to 60 days from one or two observatories, with 2 to 5 % noise, a part of which is correlated over
+half an hour, zero points of nights that differ by 0.03 mag, and gaps due to clouds. Two thirds are
+calibrated.
 
 Every curve is fitted with the default settings and appended to a file of JSON lines, so that a run
-may be stopped and continued: curves that are in the file already are not fitted again.
+can be stopped and continued: curves that the file already contains are not fitted again.
 
     nice python -m benchmarks.light_curves_unseen [--first 0] [--count 140] [--lines FILE]
     python -m benchmarks.light_curves_unseen --count 0      # the summary of FILE alone
@@ -40,20 +41,20 @@ TUMBLERS = {
     "denied": "not called tumbling",
     "silent": "other periods, TUMBLING",
 }
-FRESH = 20  # curves, after which compiled programs are given up: each holds memory maps
+FRESH = 20  # curves between clearings of JAX's caches: each program uses memory maps
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 OFFSET = 0.03  # standard deviation of the zero points of nights [mag]
 
 
 def kind_of(seed: int) -> str:
-    """What light curve ``seed`` shows."""
+    """Kind of the light curve with this seed."""
     return KINDS[seed % len(KINDS)]
 
 
 def polyhedron(rng):
-    """Normals (f, 3), areas (f,) and moments (3,), ascending, in principal axes, of a random body.
+    """Normals (f, 3), areas (f,) and ascending moments (3,) of a random body, in principal axes.
 
-    Volume integrals over the tetrahedra between the facets and the centre.
+    Volume integrals are sums over the tetrahedra between the facets and the centre.
     """
     count = int(rng.integers(12, 61))
     points = rng.normal(size=(count, 3))
@@ -83,8 +84,8 @@ def polyhedron(rng):
 class Motion:
     """Free motion about the long (LAM) or short (SAM) axis; Landau & Lifshitz, Mechanics, sec. 37.
 
-    ``moments`` ascending; ``part`` from 0 (rotation about the axis) to 1 (the separatrix); one day
-    is the unit of time. The angular momentum is along z.
+    ``moments`` are ascending; ``part`` extends from 0 (rotation about the axis) to 1 (the
+    separatrix); the unit of time is one day. The angular momentum is along z.
     """
 
     def __init__(self, moments, long_axis: bool, part: float, P_phi: float):
@@ -111,23 +112,25 @@ class Motion:
         self.P_phi, self.P_psi = P_phi, self.period / self.scale
 
     def momentum(self, t):
-        """Angular momentum in body axes (n, 3) at times of L = 1."""
+        """Angular momentum in body axes (n, 3) at times in the units in which |L| = 1."""
         sn, cn, dn, _ = ellipj(self.rate * np.asarray(t), self.m)
         parts = (dn, sn, cn) if self.long_axis else (cn, sn, dn)
         return np.stack(parts, -1) * self.sizes * self.moments
 
     def precession(self, momentum):
-        """Rate of the long axis about the momentum."""
+        """Precession rate of the long axis about the momentum."""
         across = momentum[:, 1:] ** 2
         return (across / self.moments[1:]).sum(1) / across.sum(1)
 
     def tilt(self) -> float:
-        """Greatest angle between the axis of the mode and the momentum [rad]."""
+        """Largest angle [rad] between the axis of the mode and the momentum."""
         momentum = self.momentum(np.linspace(0, self.period, 200))
         return float(np.arccos(np.abs(momentum[:, 0 if self.long_axis else 2]).min()))
 
     def attitudes(self, t, start: float, turn: float):
-        """Matrices (n, 3, 3), body to space, at ``t`` [day]; phases as parts of their periods."""
+        """Matrices (n, 3, 3), body to space, at ``t`` [day]; ``start`` and ``turn`` are phases as
+        fractions of their periods.
+        """
         own = np.asarray(t) * self.scale + start * self.period
         order = np.flatnonzero(self.waves)[1:]
         series = self.waves[order] * self.period / (2j * np.pi * order)
@@ -162,9 +165,9 @@ def random_rotation(rng):
 
 
 def geometry(t, rng):
-    """Vectors [au] from the body to Sun and Earth on circular orbits; 5 to 80 degrees phase angle.
+    """Vectors [au] from the body to Sun and Earth on circular orbits.
 
-    The body is at least 60 degrees from the Sun in the sky.
+    The phase angle is 5 to 80 degrees, and the body is at least 60 degrees from the Sun in the sky.
     """
     while True:
         radius, tilt = rng.uniform(1.1, 2.4), rng.uniform(0, 0.4)
@@ -212,7 +215,7 @@ def nights(rng, few: bool):
 
 
 def correlated_noise(t, sigma: float, part: float, rng):
-    """Noise (n,), ``part`` of its variance correlated over half an hour."""
+    """Noise (n,), of whose variance ``part`` is correlated over half an hour."""
     white, slow = rng.normal(size=(2, t.size))
     for k in range(1, t.size):
         keep = math.exp(-(t[k] - t[k - 1]) * 48)
@@ -272,7 +275,7 @@ def light_curve(seed: int):
 
 
 def same_motion(solution, truth: dict) -> bool:
-    """Mode, and both frequencies within half of the inverse span."""
+    """Whether the mode agrees, and both frequencies to half of the inverse span."""
     return solution.mode.name == truth["mode"] and all(
         abs(1 / getattr(solution, name) - 1 / truth[name]) < 0.5 / truth["span"]
         for name in ("P_phi", "P_psi")
@@ -280,11 +283,12 @@ def same_motion(solution, truth: dict) -> bool:
 
 
 def score(truth: dict, verdict: str, right: list[bool]) -> str:
-    """How the fit of a curve ended; ``right``: which of the listed solutions are, the best first.
+    """Outcome of a fit; ``right``: whether each listed solution, best first, is the true motion.
 
-    right: in first place, TUMBLING; right, ambiguous: in first place, AMBIGUOUS; listed: not first,
-    AMBIGUOUS; told: not listed, AMBIGUOUS; denied: called something else than tumbling;
-    silent: a wrong motion, called TUMBLING. Of other curves: right or wrong, or silent.
+    For tumblers: "right" (in first place, TUMBLING), "right, ambiguous" (in first place,
+    AMBIGUOUS), "listed" (in another place, AMBIGUOUS), "told" (not listed, AMBIGUOUS), "denied"
+    (neither TUMBLING nor AMBIGUOUS), "silent" (a wrong motion, TUMBLING). For other curves:
+    "right", "wrong", or "silent" (TUMBLING).
     """
     if truth["kind"] != "tumbler":
         if verdict == "TUMBLING":
@@ -343,7 +347,7 @@ def case(seed: int) -> dict:
 
 
 def summary(rows: list[dict]) -> dict:
-    """Counts, and the root of the mean square of the period errors over those stated."""
+    """Counts, and the rms of the period errors divided by the stated errors."""
     tumblers = [r for r in rows if r["truth"]["kind"] == "tumbler"]
     z = np.array([z for r in tumblers if r["place"] == 0 for z in r["z"]])
     seconds = [r["seconds"] for r in rows]
@@ -380,9 +384,9 @@ def summary(rows: list[dict]) -> dict:
 
 
 def _seeds_by_commit(rows: list[dict]) -> dict[str, list[int]]:
-    """Seeds of the curves that were fitted by each commit, named by its first seven digits.
+    """Seeds of the curves that each commit (its first seven digits) fitted.
 
-    Rows of earlier versions of this script may have none.
+    Rows of earlier versions of this script may have no commit.
     """
     seeds: dict[str, list[int]] = {}
     for row in rows:

@@ -1,12 +1,12 @@
-"""What a user's call costs beside the work in it: plain ``ph.simulate`` against its bare program.
+"""Cost of an ordinary call: ``ph.simulate`` compared with its bare compiled program.
 
     python -m benchmarks.plain_calls [--quick] [--output FILE]
 
 Bodies of the families of ``problems.py`` to t = 100, one core, float64. ``bare``: the last state
-only, compiled ahead of time. ``plain``: ``ph.simulate(scene, state, [0, 100])`` as typed, with its
-checks and both times; with 100 saved times the time of a sample. ``spread``: how many times longer
-the dearest number of saved times takes than a straight line between its neighbours. Times are
-medians of programs that take turns; errors are angles against 40-digit truth.
+only, compiled ahead of time. ``plain``: ``ph.simulate(scene, state, [0, 100])`` with its input
+checks and two saved times; with 100 saved times, the time per sample. ``spread``: the largest ratio
+of the time at a number of saved times to the linear interpolation between its neighbours. Times are
+medians of programs that run alternately; errors are angles against a 40-digit reference.
 """
 
 import argparse
@@ -36,7 +36,7 @@ def states(problem, n: int) -> ph.State:
 
 
 def measure(family: str, n: int) -> dict:
-    """One row: a plain call beside its bare program."""
+    """One row: an ordinary call and its bare program."""
     problem = problems.PROBLEMS[family]
     given, state = scene(problem, np.float64), states(problem, n)
     ts = jnp.asarray([0.0, problem.horizon])
@@ -73,7 +73,7 @@ def measure(family: str, n: int) -> dict:
 
 
 def layouts(n: int) -> dict:
-    """Free bodies at several numbers of saved times; how far the worst is off its neighbours."""
+    """Free bodies at several numbers of saved times; the largest deviation from a straight line."""
     problem = problems.PROBLEMS["free"]
     given, state = scene(problem, np.float64), states(problem, n)
     calls = {

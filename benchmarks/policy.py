@@ -1,10 +1,10 @@
-"""Values of ``polhode._policy`` against others, on the scenes that they matter for.
+"""Compare values of ``polhode._policy`` with alternatives, on the scenes that they affect.
 
     python -m benchmarks.policy NAME ... [--scenes WORD ...] [--rounds 7] [--output FILE]
 
-One process for each value; they take turns. Numbers are processor time of one core, the minimum of
-the rounds, relative to the value in use: 1.5 means that the other value takes 1.5 times as long.
-``PLAIN`` is ``POLHODE_PLAIN=1``, all optimisations for CPUs off.
+Each value runs in its own process; the processes run alternately. Numbers are processor times of
+one core, minima over the rounds, relative to the value in use: 1.5 means that the alternative takes
+1.5 times as long. ``PLAIN`` is ``POLHODE_PLAIN=1``, which disables all CPU optimisations.
 """
 
 import argparse
@@ -35,7 +35,7 @@ GRADIENTS = (
 ALL = (*CLOSED, *STEPS, *GRADIENTS)
 FIELDS = (*STEPS, *GRADIENTS[2:])
 
-# the other values and the scenes, for each name
+# alternative values and scenes, for each name
 CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "FUSION": ((False,), ALL),
     "FOLDING": ((False,), FIELDS),
@@ -80,7 +80,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
 
 
 def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
-    """For each scene a function that compiles it and returns the call."""
+    """For each scene, a function that compiles it and returns the call."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -191,7 +191,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         return ready
 
     def jacobian(build):
-        """Forward mode, by 16 numbers: the start and an inertia with products."""
+        """Forward mode with respect to 16 numbers: the initial state and a full inertia tensor."""
 
         def ready():
             m, q, w = motion(build, 1)[1]
@@ -253,7 +253,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
 
 
 def serve(name: str, value: Any, scenes: list[str]) -> None:
-    """Compiles the scenes with one value, then times each of those named on the standard input."""
+    """Compile the scenes with one value, then time each scene whose name is read from stdin."""
     from polhode import _policy
 
     if name != "PLAIN":
@@ -276,7 +276,7 @@ def serve(name: str, value: Any, scenes: list[str]) -> None:
 
 
 def compare(name: str, rounds: int, words: list[str]) -> list[dict[str, Any]]:
-    """A row for each scene and other value."""
+    """One row for each scene and alternative value."""
     others, scenes = ((True,), ALL) if name == "PLAIN" else CASES[name]
     scenes = [s for s in scenes if not words or any(word in s for word in words)]
     values = [None, *others]
@@ -286,7 +286,7 @@ def compare(name: str, rounds: int, words: list[str]) -> list[dict[str, Any]]:
         environment.pop("POLHODE_PLAIN", None)
         own = name
         if value is None:
-            own = "PLAIN"  # nothing is set
+            own = "PLAIN"  # the value in use: the server sets nothing
         elif name == "PLAIN":
             environment["POLHODE_PLAIN"] = "1"
         command = [sys.executable, "-m", "benchmarks.policy", own, "--serve", json.dumps(value)]

@@ -1,7 +1,8 @@
-"""The bodies that every program of the comparison moves, and how it is scored.
+"""Families of bodies that all compared programs simulate, and the errors of their results.
 
-A problem is an inertia, what acts, a horizon and saved times; its bodies are drawn from a seed, so
-that the first bodies of any number are the same. Truth: benchmarks/truth.py.
+A problem consists of an inertia, potentials and torques, a horizon and saved times. Its bodies are
+drawn from a seed; the first bodies are the same for any number of bodies. References:
+benchmarks/truth.py.
 """
 
 import math
@@ -20,10 +21,10 @@ class Problem:
 
     ``weight``: mass times gravity times the distance of the centre of mass, which lies on body z,
     from the fixed point [N m]; gravity is along -z of space. ``gradient``: 3 mu / r^3 [1/s^2].
-    Attitudes are uniform on the sphere of quaternions, rates isotropic of size uniform in [1, 2)
-    rad/s plus ``spin`` about body z; ``flip``: instead near the intermediate axis, off by 1e-6 to
-    1e-2 of the rate. ``damping`` times the rates opposes them [N m s] and ``push`` is a constant
-    torque in body axes [N m]. The state is saved at ``saves`` equally spaced times up to
+    Attitudes are uniform on SO(3), rates isotropic of size uniform in [1, 2) rad/s plus ``spin``
+    about body z. ``flip``: instead, rates near the intermediate axis with relative offsets of 1e-6
+    to 1e-2. ``damping`` is the coefficient of a torque opposite to the rates [N m s], and ``push``
+    a constant torque in body axes [N m]. The state is saved at ``saves`` equally spaced times up to
     ``horizon`` [s].
     """
 
@@ -89,18 +90,18 @@ SATELLITE = Problem(
     damping=0.05,
     push=(0.02, -0.01, 0.03),
 )
-"""Of the benchmark on accelerators: torques in closed form there are none for."""
+"""The problem of the benchmark on accelerators, with torques that have no closed form."""
 
 
 def errors(
     exact: dict[str, np.ndarray], wxyz: np.ndarray, omega: np.ndarray | None
 ) -> dict[str, Any]:
-    """Errors of the scored bodies against truth: median and worst body.
+    """Errors of the scored bodies against the reference: median and largest error.
 
     ``exact``: see ``truth.truth``; ``wxyz`` (n, saves, 4) and ``omega`` (n, saves, 3) at the saved
-    times. Attitude: angle between estimate and truth [rad]; rates: relative to their size; of each
-    body the worst over the scored times. A value that is not finite counts as an error of pi, and
-    in ``failed``.
+    times. Attitude errors are angles [rad], rate errors are relative to the size of the rates; the
+    error of a body is the largest over the scored times. A value that is not finite counts as an
+    error of pi, and in ``failed``.
     """
     at = exact["index"]
     n = min(len(wxyz), len(exact["wxyz"]))
@@ -109,7 +110,7 @@ def errors(
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
         sign = np.where(np.sum(q * true, axis=-1, keepdims=True) < 0, -1, 1)
         half = np.linalg.norm(sign * q - true, axis=-1) / 2
-        angle = 4 * np.arcsin(np.minimum(half, math.sqrt(0.5)))  # no cancellation near zero
+        angle = 4 * np.arcsin(np.minimum(half, math.sqrt(0.5)))  # accurate near zero
         angle = np.where(np.isfinite(angle), angle, math.pi).max(axis=1)
     found = {
         "scored": n,

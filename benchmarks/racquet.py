@@ -1,17 +1,20 @@
 """Inertia ratios of a tossed racquet from 120 recordings of a phone's gyroscope.
 
 Recordings: University of British Columbia (doi:10.14288/1.0448943), 100 Hz, 0.4 to 1.2 s each; not
-shipped with the project, expected in ``../shared/data/ubc_racquet_toss`` or given by ``--data``.
-Every trial is fitted alone, all in one call, and those of a round (one mounting of the phone)
-together; those of the third, the largest, also without the fast ones (more than 15 rad/s, where the
-drag of the air shows), these alone, and with a drag that is fitted. The likelihood of the readings
-(``fit_balance``, without a wheel) takes slow and fast ones of the third, as recorded and with 0.1 s
-cut off both ends, where hands may still touch; beside it the fit with a drag of the same cuts.
-Published: 0.067(13) : 0.909(320) : 1 by pendulum, 0.0660 : 0.9348 : 1 from 63 trials together at
-0.32 rad/s rms, periods off by 16.9 %; of unconstrained single fits 54 of 117 fail.
+part of the project, expected in ``../shared/data/ubc_racquet_toss`` or the folder ``--data``.
 
-The flip period is the mean time between changes of sign of the rate about the middle axis, of the
-fitted motion and of the data.
+Every trial is fitted alone, all in one call. The trials of a round (one mounting of the phone) are
+also fitted together. For the third round, the largest, there are further joint fits: without the
+fast trials (more than 15 rad/s, where drag matters), of the fast trials alone, and with a fitted
+drag. The likelihood of the readings (``fit_balance``, without a wheel) is applied to slow and fast
+trials of the third round, as recorded and without the first and last 0.1 s, during which hands may
+touch the racquet; the fit with drag is applied to the same parts.
+
+Published: 0.067(13) : 0.909(320) : 1 by pendulum; 0.0660 : 0.9348 : 1 from 63 trials together at
+0.32 rad/s rms, with period errors of 16.9 %; 54 of 117 unconstrained single fits fail.
+
+The flip period is the mean time between sign changes of the rate about the intermediate axis, of
+the fitted motion and of the data.
 
     python -m benchmarks.racquet [--data FOLDER] [--output out/benchmarks/racquet.json]
 """
@@ -59,7 +62,7 @@ def load(folder):
 
 
 def padded(trials):
-    """Times and rates of trials of different length, the missing ends as gaps."""
+    """Times and rates of trials of different length, padded with NaN."""
     longest = max(map(len, trials))
     times = np.zeros((len(trials), longest))
     rates = np.full((len(trials), longest, 3), np.nan)
@@ -71,7 +74,7 @@ def padded(trials):
 
 
 def alone(trials):
-    """What became of every trial by itself."""
+    """Results of fits of single trials."""
     times, rates = padded(trials)
     options = FitOptions(gyroscope=Gyroscope.ideal())
     fit = fit_inertia(times, rates, throw=False, options=options)
@@ -94,13 +97,13 @@ def alone(trials):
 
 
 def crossings(times, x):
-    """Times of changes of sign."""
+    """Times of the sign changes of x."""
     k = np.flatnonzero(x[1:] * x[:-1] < 0)
     return times[k] - x[k] * (times[k + 1] - times[k]) / (x[k + 1] - x[k])
 
 
 def together(trials, motion=None):
-    """One body for the trials of a round."""
+    """Result of a joint fit of one body to the trials of a round."""
     given = [Recording.of(trial[:, 0], trial[:, 1:]) for trial in trials]
     options = FitOptions(motion=motion, max_starts=2, gyroscope=Gyroscope.ideal())
     fit = fit_recordings(given, options=options, throw=False)
@@ -132,7 +135,7 @@ def together(trials, motion=None):
 
 
 def readings(trials, cut):
-    """The likelihood of the readings of trials less ``cut`` samples at both ends."""
+    """Result of the likelihood of the readings, without ``cut`` samples at both ends of a trial."""
     trials = [one[cut : len(one) - cut] for one in trials if len(one) > 2 * cut + 20]
     given = [Recording.of(one[:, 0], one[:, 1:]) for one in trials]
     fit = fit_balance(given, Instrument(None), throw=False)

@@ -1,4 +1,4 @@
-"""Every conversion of rotations with its truth, its samples and its measure of error."""
+"""The conversions of rotations, each with its reference, its samples and its measure of error."""
 
 import itertools
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from polhode.rotation import Sequence
 
 @dataclass(frozen=True)
 class Case:
-    """One conversion: the package's function on rows, its truth, its samples and its measure."""
+    """One conversion: the package's function on rows, its reference, samples and error measure."""
 
     name: str
     function: Callable  # rows (..., n) -> rows (..., m)
@@ -36,7 +36,7 @@ def tiny_angles(dtype) -> list[float]:
 
 
 def vectors(dtype, count: int) -> list[np.ndarray]:
-    """Rotation vectors of length at most pi, random and awkward."""
+    """Rotation vectors of length at most pi, random and special."""
     rng = np.random.default_rng(7)
     axes = [*np.eye(3), np.ones(3) / np.sqrt(3), np.array([1.0, -2, 0]) / np.sqrt(5)]
     axes += [axis / np.linalg.norm(axis) for axis in rng.normal(size=(2, 3))]
@@ -49,7 +49,7 @@ def vectors(dtype, count: int) -> list[np.ndarray]:
 
 
 def eulers(dtype, count: int, is_proper: bool, stride: int) -> list[np.ndarray]:
-    """Euler angles over the closed ranges, random and awkward (of these every ``stride``-th)."""
+    """Euler angles over the closed ranges, random and special (of these every ``stride``-th)."""
     rng = np.random.default_rng(11)
     pi = float(dtype(np.pi))
     tiny = tiny_angles(dtype)[0]
@@ -107,7 +107,7 @@ def _points_of_quaternions(count):
 
 
 def _points_unrounded(count):
-    """Exact unit quaternions: what a rounded matrix stands for."""
+    """Unit quaternions in full precision, from which rounded matrices are computed."""
     return lambda dtype: [truth.from_vector(truth.exact(row)) for row in vectors(dtype, count)]
 
 
@@ -121,7 +121,7 @@ def _straight(point):
 
 
 def _turning(point):
-    """Paths of unit quaternions, turning about each body axis at unit rate."""
+    """Paths of unit quaternions: rotations about each body axis at unit rate."""
     base = truth.unit(point)
     return [(lambda h, k=k: truth.multiply(base, truth.about(k, h))) for k in range(3)]
 
@@ -158,19 +158,19 @@ def measure_matrix(computed, exact, _):
     off = [slot for slot in range(9) if slot % 4]
     size = min(mp.mpf(1), truth.norm([exact[slot] for slot in off]))
     worst_off = max(abs(error[slot]) for slot in off)
-    # near a half turn the off-diagonal entries may vanish while the angle is large
+    # near a half turn the antisymmetric part vanishes although the angle is large
     size = size if exact[0] + exact[4] + exact[8] > 2 else mp.mpf(1)
     return max(max(abs(value) for value in error), _over(worst_off, size))
 
 
 def measure_euler(sequence):
-    """Half the angle of the rotation between the exact one and that of the computed angles."""
+    """Half of the angle between the exact rotation and that of the computed angles."""
 
     def measure(computed, exact_quaternion, _):
         made = truth.from_euler(truth.exact(computed), sequence.axes, sequence.is_extrinsic)
         inverse = [exact_quaternion[0], *(-value for value in exact_quaternion[1:])]
         error = truth.norm(truth.multiply(inverse, made)[1:])
-        # proper Euler angles near zero hide a small rotation in the sum of two large angles
+        # with proper Euler angles, two large angles of opposite sign can be a small rotation
         size = mp.mpf(1) if sequence.is_proper else truth.norm(exact_quaternion[1:])
         return _over(error, size)
 
@@ -212,7 +212,7 @@ def at_identity(point):
 
 
 def plain_cases(count: int) -> list[Case]:
-    """Every conversion that has nothing to do with Euler angles."""
+    """All conversions without Euler angles."""
     return [
         Case(
             "rotation vector -> wxyz",
@@ -355,7 +355,7 @@ def euler_cases(sequence: Sequence, count: int, stride: int = 1) -> list[Case]:
             quaternions,
             _turning,
             measure_euler(sequence),
-            # closer than this a float cannot tell the two sides of the end apart
+            # closer than this, rounding may move the angle to the other side of the end
             singular=lambda point: to_end(point) < 1e-40,
             near=to_end,
         ),
@@ -363,7 +363,7 @@ def euler_cases(sequence: Sequence, count: int, stride: int = 1) -> list[Case]:
 
 
 def composed_cases(count: int, stride: int = 1) -> list[Case]:
-    """From the documents' ZYZ angles straight to every other description."""
+    """From the ZYZ angles of the documents directly to every other representation."""
 
     def angles(row):
         return row[..., 0], row[..., 1], row[..., 2]

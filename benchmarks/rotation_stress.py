@@ -1,10 +1,11 @@
-"""Stress table of all rotation conversions: worst error, worst gradient errors, per dtype.
+"""Stress test of all rotation conversions: largest errors of values and derivatives, by dtype.
 
 Run ``python -m benchmarks.rotation_stress [--quick] [--output FILE]``. Values, first derivatives
 (forward and reverse mode) and second derivatives are compared with 120-digit arithmetic on random
 samples and on samples at and near the identity, half turns, the ends of the angle ranges, and both
-sides of every threshold. All errors are in units of eps; values relative to the rotation angle
-where it is small, derivatives relative to the largest derivative of the sample.
+sides of every threshold. All errors are in units of eps; those of values are relative to the
+rotation angle where it is small, those of derivatives relative to the largest derivative of the
+sample.
 """
 
 import argparse
@@ -31,7 +32,7 @@ def _rounded(values, dtype) -> np.ndarray:
 
 
 def _derivative_program(function):
-    """Value, first and second derivative along paths, and a reverse-mode product."""
+    """Value, first and second derivatives along paths, and a reverse-mode product."""
 
     def along(rows, speeds, bends):
         def path(h):
@@ -53,9 +54,9 @@ def _derivative_program(function):
     return jax.jit(everything)
 
 
-@mp.workdps(truth.DIGITS)  # whatever ran before in this process
+@mp.workdps(truth.DIGITS)  # independent of the precision that other code has set
 def measure_case(case: Case, dtype) -> dict[str, float]:
-    """Worst errors in units of eps: value, first derivative (both modes), second derivative."""
+    """Largest errors in units of eps: value, first derivative (both modes), second derivative."""
     eps = float(np.finfo(dtype).eps)
     huge = float(np.finfo(dtype).max) ** 0.5
     points = case.points(dtype)
@@ -109,8 +110,8 @@ def measure_case(case: Case, dtype) -> dict[str, float]:
             worst["first"] = max(
                 worst["first"], forward_error / scale / eps, reverse_error / scale / eps / 3
             )
-        # next to the singularity of a chart, second derivatives vary on the scale slope**2
-        with np.errstate(over="ignore"):  # an infinite scale is left out below
+        # next to a singularity of the coordinates, second derivatives scale as slope**2
+        with np.errstate(over="ignore"):  # an infinite scale is skipped below
             scale = max(np.abs(curves).max(), scale, scale * min(scale, huge))
         if np.isfinite(scale) and scale < huge:
             curve_error = np.abs(second[number] - curves).max()
@@ -120,7 +121,7 @@ def measure_case(case: Case, dtype) -> dict[str, float]:
 
 
 def worst_by_conversion(rows: list[dict]) -> list[dict]:
-    """One row for each conversion, and one each way for the worst of all Euler sequences."""
+    """One row for each conversion; the Euler sequences share one row for each direction."""
     groups: dict[str, dict[str, float]] = {}
     for row in rows:
         name = row["conversion"]

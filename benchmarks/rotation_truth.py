@@ -1,7 +1,7 @@
 """Rotation conversions in 120-digit arithmetic (mpmath), independent of the package.
 
-Everything starts from elementary rotations: a quaternion is a product of turns about coordinate
-axes or exp of half a rotation vector; no formula of the package is used.
+A quaternion is a product of rotations about coordinate axes, or the exponential of half a rotation
+vector; no formula of the package is used.
 """
 
 from collections.abc import Callable, Sequence as Seq
@@ -14,7 +14,7 @@ Vector = list
 
 
 def exact(values: Seq[float]) -> Vector:
-    """Floating-point numbers as they are, without rounding."""
+    """Floating-point numbers as mpmath numbers, without rounding."""
     return [mp.mpf(float(value)) for value in values]
 
 
@@ -71,12 +71,12 @@ def from_rodrigues(parameters: Vector) -> Vector:
 
 
 def side(quaternion: Vector) -> int:
-    """Sign that makes the scalar part not negative."""
+    """Sign that makes the scalar part non-negative."""
     return -1 if quaternion[0] < 0 else 1
 
 
 def to_vector(quaternion: Vector, sign: int) -> Vector:
-    """Rotation vector of ``sign * quaternion``; the sign is kept fixed to differentiate."""
+    """Rotation vector of ``sign * quaternion``, where ``sign`` is not differentiated."""
     w, *v = (sign * value for value in unit(quaternion))
     size = norm(v)
     if size == 0:
@@ -116,7 +116,7 @@ def to_matrix(quaternion: Vector) -> Vector:
 def derivatives(function: Callable[[Vector], Vector], path: Callable, step: mp.mpf):
     """Value, first and second derivative at 0 of ``function(path(h))``, by central differences.
 
-    At 120 digits a step of 1e-20 leaves errors below 1e-38.
+    With 120 digits a step of 1e-20 leaves errors below 1e-38.
     """
     middle, ahead, behind = (function(path(h)) for h in (mp.mpf(0), step, -step))
     first = [(a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True)]
@@ -125,7 +125,7 @@ def derivatives(function: Callable[[Vector], Vector], path: Callable, step: mp.m
 
 
 def to_euler(quaternion: Vector, axes: tuple[int, int, int], extrinsic: bool) -> Vector:
-    """Euler angles from matrix entries; the second angle must not be at an end of its range."""
+    """Euler angles from matrix entries; the second angle must be inside its range."""
     flat = to_matrix(quaternion)
     i, j, k = axes[::-1] if extrinsic else axes
 
@@ -147,6 +147,6 @@ def to_euler(quaternion: Vector, axes: tuple[int, int, int], extrinsic: bool) ->
 
 
 def unwrapped(angles: Vector, near: Vector) -> Vector:
-    """The same angles, moved by whole turns to lie close to ``near``."""
+    """The same angles, shifted by full turns to be close to ``near``."""
     turn = 2 * mp.pi
     return [a + turn * mp.nint((b - a) / turn) for a, b in zip(angles, near, strict=True)]

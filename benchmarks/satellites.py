@@ -1,17 +1,17 @@
 """Inertia of satellites from a gyroscope and a wheel: 60 s at 10 Hz, noise of 1e-4 rad/s.
 
-After arXiv:2510.16738, whose satellites and wheel programs are in a repository that could not be
-reached; assumed here: cuboids of 4, 20 and 60 kg with small products of inertia, one wheel along
-(1, 1, 1) that follows six sines and makes rates of some 0.2 rad/s, the first rates up to 0.3
-rad/s about each axis, the wheel's speed known. Disturbed: a torque that forgets within 30 s and
-would change the rates by 1e-5 rad/s^2.
+The study follows arXiv:2510.16738; its satellites and wheel programmes are not available and are
+replaced by assumptions: cuboids of 4, 20 and 60 kg with small products of inertia; one wheel along
+(1, 1, 1) whose known speed is a sum of six sines and which causes rates of about 0.2 rad/s; initial
+rates up to 0.3 rad/s about each axis. Disturbed: a random torque with a correlation time of 30 s
+that would change the rates by 1e-5 rad/s^2.
 
-Three estimators of the six entries on the same readings: least squares on Euler's equations with
-central differences; instrumental variables, the same equations with regressors that the motion of
-the first estimate gives (they hold no noise of the readings); the estimator of
-``benchmarks.throws`` with the wheel's instrument. Printed: mean over runs of |tensor - true| /
-|true| (Frobenius), in per cent, and of the last the rms of errors of the moments over the standard
-deviations stated.
+Three estimators of the six entries use the same readings: least squares on Euler's equations with
+central differences; instrumental variables, that is, the same equations with regressors from the
+simulated motion of the first estimate, which are independent of the noise of the readings; and the
+estimator of ``benchmarks.throws``. The output contains the mean over the runs of |tensor - true| /
+|true| (Frobenius), in per cent, and for the last estimator the rms of the errors of the moments
+over the stated standard deviations.
 
     python -m benchmarks.satellites [--runs 20]
 """
@@ -36,7 +36,7 @@ STEP, LENGTH, PARTS = 0.1, 60.0, 10
 FIRST = 0.3
 NOISE, PUSH, MEMORY = 1e-4, 1e-5, 30.0
 AXIS = np.ones(3) / np.sqrt(3)
-# inertia, kg m^2; the wheel's spin inertia, kg m^2, and speed that its sines reach, rad/s
+# inertia [kg m^2]; spin inertia [kg m^2] and maximum speed [rad/s] of the wheel
 SATELLITES = {
     "4 kg": (
         [[0.036, 0.0008, -0.0005], [0.0008, 0.034, 0.0004], [-0.0005, 0.0004, 0.0075]],
@@ -46,19 +46,19 @@ SATELLITES = {
     "20 kg": ([[0.32, 0.008, -0.006], [0.008, 0.27, 0.01], [-0.006, 0.01, 0.19]], 2e-4, 600.0),
     "60 kg": ([[3.1, 0.06, 0.09], [0.06, 2.6, -0.08], [0.09, -0.08, 2.1]], 2e-3, 600.0),
 }
-# of the wheel: cycles in a minute and phases
+# speed of the wheel: cycles per minute and phases of its sines
 CYCLES, PHASES = np.array([1.3, 2.9, 5.1, 7.7, 9.1, 12.3]), np.array([0.3, 1.9, 4.1, 0.9, 5.2, 2.7])
 
 
 def program(t):
-    """The wheel's speed over the largest."""
+    """Speed of the wheel relative to its maximum."""
     angles = 2 * np.pi * CYCLES * t[..., None] / 60 + PHASES
     return jnp.sum(jnp.sin(angles), axis=-1) / len(CYCLES)
 
 
 @jax.jit
 def flown(key, tensor, spin, fastest, push):
-    """Rates (t, 3) without noise; Runge-Kutta steps of 10 ms."""
+    """Rates (t, 3) without noise, by Runge-Kutta steps of 10 ms."""
     first, begin, fresh = jax.random.split(key, 3)
     size, inverse, dt = jnp.trace(tensor) / 2, jnp.linalg.inv(tensor), STEP / PARTS
     count = round(LENGTH / STEP) * PARTS + 1
@@ -87,7 +87,7 @@ def flown(key, tensor, spin, fastest, push):
 
 
 def equations(rates, slopes, spin, fastest, times):
-    """Rows (3 t, 6) and right sides of Euler's equations for xx, yy, zz, yz, zx, xy."""
+    """Matrix (3 t, 6) and right side of Euler's equations for xx, yy, zz, yz, zx, xy."""
 
     def rows(v):
         x, y, z = v.T
@@ -134,7 +134,7 @@ def regressions(reading, spin, fastest, times):
 
 
 def study(name, push, runs):
-    """Errors of one satellite."""
+    """Errors for one satellite."""
     tensor, spin, fastest = SATELLITES[name]
     true = np.array(tensor)
     times = jnp.linspace(0, LENGTH, round(LENGTH / STEP) + 1)

@@ -1,14 +1,14 @@
-"""Ensembles: speed beside computing and writing alone, memory, devices, kills, cost per body.
+"""Ensembles: time of a run, of computing and of writing, memory, devices, kills, cost per body.
 
     python -m benchmarks.scale store        1e6 bodies x 100 times and 1e7 x 10 (free disk: 12 GB)
     python -m benchmarks.scale cost         ns per body and per saved state, on one core
-    python -m benchmarks.scale devices      a sharded batch of 1e6 bodies beside one device
+    python -m benchmarks.scale devices      a sharded batch of 1e6 bodies compared with one device
     python -m benchmarks.scale kills        20 kills at random moments
     python -m benchmarks.scale parts        one part, two, and a dask cluster of two, a core each
     python -m benchmarks.scale model        the tables of docs/scale.md, from the committed results
 
-Each but the last writes ``scale_NAME.json``. Stores of kills, parts and clusters are compared with
-an undisturbed one bit by bit.
+Each command except the last writes ``scale_NAME.json``. Stores of kills, parts and clusters are
+compared bit by bit with that of an undisturbed run.
 """
 
 import argparse
@@ -34,7 +34,7 @@ CHUNK = 16384
 
 
 def make(bodies: int):
-    """Free triaxial bodies of any attitude."""
+    """Free triaxial bodies with uniform attitudes."""
     import jax.numpy as jnp
 
     import polhode as ph
@@ -47,7 +47,7 @@ def make(bodies: int):
 
 
 def store(bodies: int, times: int, folder: Path) -> dict:
-    """The whole run beside the same blocks computed alone and the same bytes written alone."""
+    """A complete run, and the same blocks computed alone and the same bytes written alone."""
     import jax
     import numpy as np
 
@@ -64,7 +64,7 @@ def store(bodies: int, times: int, folder: Path) -> dict:
     def compute() -> float:
         began = time.perf_counter()
         flying = collections.deque()
-        for first in starts:  # as the run does: as many at a time as there are cores, and one
+        for first in starts:  # as in a run: as many blocks at a time as there are cores, plus one
             flying.append(block(first))
             if len(flying) > _report.threads():
                 jax.block_until_ready(flying.popleft())
@@ -93,7 +93,7 @@ def store(bodies: int, times: int, folder: Path) -> dict:
         shutil.rmtree(folder / "run.zarr")
         return spent
 
-    # the disk's speed changes from minute to minute: before and after
+    # before and after the run, since the disk's speed changes from minute to minute
     writing = [write()]
     computing = [compute()]
     running = run()
@@ -117,7 +117,7 @@ def store(bodies: int, times: int, folder: Path) -> dict:
 
 
 def cost(bodies: int = 65_536) -> dict:
-    """Nanoseconds per body and per saved state from blocks of 10 and of 100 times, one core."""
+    """Nanoseconds per body and per saved state, from blocks of 10 and of 100 times, on one core."""
     import jax
     import numpy as np
 
@@ -146,7 +146,7 @@ def cost(bodies: int = 65_536) -> dict:
 
 
 def devices(bodies: int, times: int) -> dict:
-    """Plain ``simulate`` of a batch on one device and sharded over 2, 4, 8 forced ones."""
+    """``simulate`` of a batch on one device, and sharded over 2, 4 and 8 virtual devices."""
     import jax
     import numpy as np
     from jax.sharding import Mesh, NamedSharding, PartitionSpec
@@ -180,7 +180,7 @@ def devices(bodies: int, times: int) -> dict:
 
 
 def child(path: str) -> None:
-    """One run of 300,000 bodies."""
+    """One run of 300,000 bodies, in a process that is killed."""
     import numpy as np
 
     from polhode import ensemble as ens
@@ -200,7 +200,7 @@ def _equal(one: Path, other: Path) -> bool:
 
 
 def kills(count: int, folder: Path) -> dict:
-    """Kill and restart one run after another."""
+    """Kill and restart runs at random moments."""
     whole = folder / "whole.zarr"
     began = time.perf_counter()
     assert _child(whole).wait() == 0
@@ -256,8 +256,8 @@ high = 3.2
 
 
 def parts(folder: Path, bodies: int = 262_144) -> dict:
-    """Heavy tops over 1,000 s in 32 chunks, statistics only: by one process, by two parts and by a
-    dask cluster of two workers, every process of them on a core of its own.
+    """Heavy tops over 1,000 s in 32 chunks, statistics only: by one process, by two parts, and by a
+    dask cluster of two workers, each process on its own core.
     """
     scene = folder / "tops.toml"
     scene.write_text(TOPS.replace("BODIES", str(bodies)))
@@ -284,7 +284,7 @@ def parts(folder: Path, bodies: int = 262_144) -> dict:
         found[f"{name}_cpu_s"] = busy
 
     found = {"bodies": bodies, "load": os.getloadavg()[0]}
-    clock("first", [[run("first", "--part", "1/32")]])  # compiled programs are kept
+    clock("first", [[run("first", "--part", "1/32")]])  # fills the cache of compiled programs
     clock("one", [[run("one")]])
     clock("parts", [[run("parts", "--part", f"{i}/2") for i in (1, 2)], [run("parts")]])
     address = "127.0.0.1:8799"
@@ -292,7 +292,7 @@ def parts(folder: Path, bodies: int = 262_144) -> dict:
     worker = ["distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
     cluster = [start(cores[0], scheduler, True)] + [start(core, worker, True) for core in cores]
     try:
-        time.sleep(8.0)  # the cluster is there before the run, as on a machine that has one
+        time.sleep(8.0)  # the time of the run does not include the start of the cluster
         clock("dask", [[run("dask", "--scheduler", address)]])
     finally:
         for process in reversed(cluster):
@@ -311,7 +311,7 @@ BUS_GB_PER_S = 25.0
 
 
 def model() -> str:
-    """What 1e9 bodies take, from the committed cost and store; the same for what was measured."""
+    """Markdown tables of docs/scale.md: extrapolation to 1e9 bodies, and measured runs."""
     cost, store = (_report.read(f"scale_{name}")["numbers"] for name in ("cost", "store"))
     body, state = cost["ns_per_body"] * 1e-9, cost["ns_per_state"] * 1e-9
     disk = min(case["raw_write_GB_per_s"] for case in store.values())
@@ -324,7 +324,7 @@ def model() -> str:
 
     lines = [
         "| 1e9 bodies x | 1 core | 64 cores | 1 GPU, at least | 64 GPUs, at least | store |"
-        " run on two cores and that disk |",
+        " run on two cores and the measured disk |",
         "|---|---|---|---|---|---|---|",
     ]
     for case in store.values():
@@ -352,10 +352,10 @@ def model() -> str:
     rate = cost["bytes_per_state"] / cost["ns_per_state"]
     lines += [
         "",
-        f"One core: {cost['ns_per_body']:.0f} ns per body and {cost['ns_per_state']:.0f} ns per"
-        f" saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many times"
-        f" are saved. That disk takes {disk:.2g} GB/s: with more than {disk / rate:.1f} cores the"
-        " disk is the bottleneck.",
+        f"One core needs {cost['ns_per_body']:.0f} ns per body and {cost['ns_per_state']:.0f} ns"
+        f" per saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many"
+        f" times are saved. The disk writes {disk:.2g} GB/s: with more than {disk / rate:.1f} cores"
+        " it is the bottleneck.",
         "",
         _others(*(_report.read(f"scale_{name}")["numbers"] for name in ("kills", "devices"))),
     ]
@@ -366,13 +366,12 @@ def _others(kills: dict, devices: dict) -> str:
     over = ", ".join(f"{100 + 100 * devices['over_one_device'][n]:.0f} %" for n in ("2", "4", "8"))
     away = max(devices["greatest_difference"].values())
     return (
-        f"Kills: {kills['kills']} at random moments of {kills['stores']} runs;"
-        f" {kills['stores_equal']} of the {kills['stores']} stores equal an undisturbed one bit by"
-        " bit.\n\n"
+        f"Interruptions: after {kills['kills']} kills at random moments of {kills['stores']} runs,"
+        f" {kills['stores_equal']} of the {kills['stores']} stores are equal to an undisturbed one"
+        " bit by bit.\n\n"
         f"Devices: `ph.simulate` of {devices['bodies']:,} bodies x {devices['times']} times sharded"
-        f" over 2, 4 and 8 forced devices of two cores takes {over} of the time on one device, and"
-        f" its attitudes lie within {away:.0e} of those (more than a factor of two cannot be seen"
-        " on two cores)."
+        f" over 2, 4 and 8 virtual devices of two cores takes {over} of the time on one device, and"
+        f" its attitudes differ by at most {away:.0e} (two cores allow at most a factor of two)."
     )
 
 
@@ -409,7 +408,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         if options.what == "store" and options.case is None:
             found = {}
-            for case in CASES:  # memory is that of a process: one for each
+            for case in CASES:  # peak memory is that of a process: use one for each case
                 part = Path(folder) / "part.json"
                 command = [sys.executable, "-m", "benchmarks.scale", "store", "--case", case]
                 where = ["--folder", folder, "--output", str(part)]

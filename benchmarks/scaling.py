@@ -1,9 +1,10 @@
-"""Time and memory of the default method against bodies, horizon and saved times.
+"""Time and memory of the default method against number of bodies, horizon and saved times.
 
     python -m benchmarks.scaling [--quick] [--output out/scaling.json]
 
-One core. Memory is that of the compiled program: arguments, results and temporaries. Bodies times
-samples beyond a chunk are worked on chunk after chunk, so that temporaries stop growing.
+One core. Memory is that of the compiled program: arguments, results and temporaries. If bodies
+times samples exceed a chunk, chunks are computed one after another, so that temporaries do not
+grow.
 """
 
 import argparse

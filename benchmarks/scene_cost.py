@@ -1,18 +1,19 @@
-"""What each kind of scene costs, what each part of a scene adds, and what reading a body costs.
+"""Cost of each kind of scene, of each part of a scene, and of reading mass properties.
 
     python -m benchmarks.scene_cost [--quick] [--bodies 1000] [--output out/scene_cost.json]
 
 For every scene: floating-point operations and bytes per body as counted by the compiler (a loop's
 body is counted once), and measured nanoseconds per body on one core, median of repeats. Times of
-all tables are processor time.
+all tables are processor times.
 
-For every part: one satellite and 50 of them on an orbit for an hour under the gravity gradient,
-which is the row that the others are compared with, and the same with the part; 61 samples,
-``rtol=1e-6``. Integration steps (the median of the bodies), seconds of the first call (tracing,
-compilation and run, in a process that has simulated another scene before), and milliseconds of a
-later call of the compiled program, with its ratio to that of the first row.
+For every part: one satellite and 50 satellites on an orbit for an hour, under the gravity gradient
+alone (the first row) and with the part; 61 samples, ``rtol=1e-6``. The columns are integration
+steps (the median of the bodies), seconds of the first call (tracing, compilation and run, in a
+process that has simulated another scene before), milliseconds of a later call of the compiled
+program, and its ratio to that of the first row.
 
-For every file format: the same times to read the mass properties of one body.
+For every file format: the times of the first and of later reads of the mass properties of one
+body.
 """
 
 import argparse
@@ -103,7 +104,7 @@ def build(name: str, n: int) -> tuple[dict, Callable]:
 
 
 def measure(names: list[str], n: int, repeats: int = 7) -> list[dict]:
-    """The table; the programs take turns."""
+    """Rows of all scenes; the programs are timed alternately."""
     built = {name: build(name, n) for name in names}
     calls = {name: call for name, (_, call) in built.items()}
     times = _report.in_turn(calls, repeats=repeats, processor_time=True)
@@ -113,7 +114,7 @@ def measure(names: list[str], n: int, repeats: int = 7) -> list[dict]:
     ]
 
 
-# What a part costs
+# Cost of a part
 
 MU, AXIS = 3.986004418e14, 6.871e6
 SUN = (1.0, 0.0, 0.0)
@@ -123,14 +124,14 @@ PART_BODIES = (1, 50)
 
 
 class Satellite(NamedTuple):
-    """A scene and what is saved of it."""
+    """A scene, and the recorded quantities."""
 
     scene: ph.Scene
     record: ph.Record = ph.Record()
 
 
 def satellite_states(n: int) -> ph.State:
-    """Random attitudes and rates of 5 deg/s; one body has no batch axis."""
+    """Random attitudes and rates of 5 deg/s; a single body has no batch axis."""
     rng = np.random.default_rng(5)
     omega, wxyz = rng.normal(size=(n, 3)), rng.normal(size=(n, 4))
     omega *= np.deg2rad(5.0) / np.linalg.norm(omega, axis=1, keepdims=True)
@@ -138,7 +139,7 @@ def satellite_states(n: int) -> ph.State:
 
 
 def plates() -> ph.Plates:
-    """The faces of a box and a panel, one side of which is exposed."""
+    """The faces of a box, and a panel exposed on one side."""
     edges = np.array([0.2263, 0.1, 0.366])
     faces = np.prod(edges) / edges
     return ph.Plates(
@@ -149,12 +150,12 @@ def plates() -> ph.Plates:
 
 
 def attitude_control(t, wxyz, omega_body):
-    """Torque on the body to the attitude (1, 0, 0, 0) [N m]."""
+    """Torque on the body towards the attitude (1, 0, 0, 0) [N m]."""
     return -2e-3 * jnp.sign(wxyz[0]) * wxyz[1:] - 0.03 * omega_body
 
 
 def booms(t):
-    """Moments of a box with two tip masses that move out along body x for ten minutes."""
+    """Moments of a box with two tip masses that extend along body x for ten minutes."""
     length = 0.1 + 1e-3 * jnp.minimum(t, 600.0)
     return jnp.array([0.1440, 0.1852, 0.0612]) + 0.2 * length**2 * jnp.array([0.0, 1.0, 1.0])
 
@@ -165,7 +166,7 @@ def momentum(trajectory):
 
 
 def satellites() -> dict[str, Satellite]:
-    """Name of the part -> the satellite with it; the first has none."""
+    """Name of the part -> satellite with this part; the first entry has none."""
     body = ph.Inertia.from_box(12.0, [0.2263, 0.1, 0.366])
     orbit = ph.KeplerOrbit(MU, AXIS, inclination=np.deg2rad(97.4))
     gradient = ph.GravityGradient(MU, orbit)
@@ -213,7 +214,7 @@ def satellite_call(satellite: Satellite, n: int) -> Callable:
 def measure_parts(
     names: list[str], bodies: tuple[int, ...] = PART_BODIES, repeats: int = 9
 ) -> list[dict]:
-    """The table of parts, which begins with the base; the programs take turns."""
+    """Rows of all parts, beginning with none; the programs are timed alternately."""
     named, rows = satellites(), []
     satellite_call(Satellite(ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))), 1)()
     for n in bodies:
@@ -234,7 +235,7 @@ def measure_parts(
     return rows
 
 
-# What reading a body costs
+# Cost of reading a body
 
 LINK = """<link name="link{}"><inertial><origin xyz="0.1 0 0.2" rpy="0.1 0.2 0.3"/>
 <mass value="2.5"/><inertia ixx="0.1" iyy="0.12" izz="0.07" ixy="0" ixz="0" iyz="0"/>
@@ -243,7 +244,7 @@ BODY = """<body name="body{}"><freejoint/><geom type="box" size="0.1 0.2 0.3" ma
 
 
 def measure_files(repeats: int = 9) -> list[dict]:
-    """Milliseconds to read one body; formats whose package is missing are left out."""
+    """Milliseconds to read one body, for each format whose reader is installed."""
     with tempfile.TemporaryDirectory() as folder:
         urdf, mjcf, mesh = (Path(folder) / name for name in ("a.urdf", "a.xml", "a.stl"))
         links, bodies = ("".join(text.format(i) for i in range(30)) for text in (LINK, BODY))

@@ -1,16 +1,16 @@
-"""The stress suite of the exact free motion: worst errors of every family, printed and drawn.
+"""Stress suite of the closed-form free motion: largest errors of every family, printed and drawn.
 
     python -m benchmarks.stress [--quick] [--output stress.json]
 
-Bodies: benchmarks/stress_families.py. Truth: tests/stress/stress_truth.json, from 50 digits. The
-motion goes through ``ph.simulate(..., ph.ClosedForm())``, Euler angles through
-``ph.State.from_euler``. Errors are in units of eps x max(1, angle), the angle [rad] that the body
-turned through: of the attitude [rad], of the rates relative to their size (for states given
-in Euler angles, to that of the angles' rates where these are larger and cancel), and of the
-derivatives along two directions (a relative change of the inertia; one of attitude, rates and
-time), forward and reverse, relative to the larger of the exact derivative and the natural size
-(1 rad, the rate).
-The figure, beside the output, is drawn from the JSON.
+Bodies: benchmarks/stress_families.py. References: tests/stress/stress_truth.json, computed with 50
+digits. The motion is computed by ``ph.simulate(..., ph.ClosedForm())``, Euler angles are converted
+by ``ph.State.from_euler``. Errors are in units of eps x max(1, angle), where angle [rad] is the
+rotation angle of the body. They are those of the attitude [rad]; of the rates relative to their
+size (for states given in Euler angles, relative to that of the angles' rates if these are larger
+and cancel); and of the derivatives along two directions (a relative change of the inertia; a change
+of attitude, rates and time), in forward and reverse mode, relative to the larger of the exact
+derivative and the natural size (1 rad, the rate). The figure, written next to the output, is drawn
+from the JSON file.
 """
 
 import argparse
@@ -30,7 +30,7 @@ COLUMNS = ("attitude", "rates", "forward", "reverse")
 
 
 def load() -> list[tuple[Body, dict]]:
-    """Bodies with their truth."""
+    """Bodies and their references."""
     table = {(c["family"], c["name"]): c for c in json.loads(TRUTH.read_text())}
     pairs = [(body, table[body.family, body.name]) for body in bodies()]
     for body, row in pairs:
@@ -53,7 +53,7 @@ def _tensor(x):
 
 
 def final_states(inputs: dict) -> dict:
-    """Attitude and rates (n, 7) of the bodies of each kind from their inputs (n, k)."""
+    """Attitude and rates (n, 7) of the bodies of each kind, from their inputs (n, k)."""
     plain, angles = inputs["diagonal"], inputs["euler"]
     given = ph.State.from_euler(angles[:, 3], angles[:, 4], angles[:, 5], rates=angles[:, 6:9])
     state = ph.State(
@@ -77,7 +77,9 @@ def final_states(inputs: dict) -> dict:
 
 
 def solve(inputs: dict, moves: dict, weights: dict, forward: bool, reverse: bool) -> tuple:
-    """Final states; derivatives along the moves (2, n, k); those of the weighted sum, reverse."""
+    """Final states, derivatives along the directions (2, n, k), and the reverse-mode derivative of
+    a weighted sum.
+    """
     values, ahead, back = None, None, None
     if reverse:
         values, pull = jax.vjp(final_states, inputs)
@@ -95,13 +97,13 @@ def _exact(words) -> np.ndarray:
 
 
 def _relative(error: np.ndarray, size) -> np.longdouble:
-    """Infinite for any error of a vector that should vanish."""
+    """Relative error; infinite for any error of a vector that should vanish."""
     off = np.sqrt(np.sum(error**2))
     return np.longdouble(0) if off == 0 else off / size if size > 0 else np.longdouble(np.inf)
 
 
 def measure(dtype, pairs: list, forward: bool = True, reverse: bool = True) -> list[dict]:
-    """Errors of every body that the dtype holds, in units of eps x max(1, angle)."""
+    """Errors of every body whose inputs the dtype represents, in units of eps x max(1, angle)."""
     pairs = [p for p in pairs if dtype == np.float64 or p[0].fits_single]
     kinds = {}
     for body, row in pairs:
@@ -136,7 +138,7 @@ def measure(dtype, pairs: list, forward: bool = True, reverse: bool = True) -> l
 
 
 def _size(vector: np.ndarray) -> np.longdouble:
-    """The length, or 1 of nothing."""
+    """Length of a vector; 1 for the zero vector."""
     return np.sqrt(np.sum(vector**2)) or np.longdouble(1)
 
 
@@ -145,7 +147,9 @@ def _sign(found, exact):
 
 
 def _natural_rate(body: Body, row: dict) -> np.longdouble:
-    """Of the body; the rates of Euler's angles where those are larger and cancel."""
+    """Size of the body rates; that of the rates of the Euler angles if it is larger, because these
+    cancel.
+    """
     rates = [row["omega_t"]] + ([body.rates] if body.kind == "euler" else [])
     return max(np.sqrt(np.sum(_exact([x])[0] ** 2)) for x in rates)
 
@@ -157,7 +161,7 @@ def _value_errors(found, row, rate):
 
 
 def _sizes(exact, rate):
-    """Of a derivative of the attitude and of one of the rates, at least the natural ones."""
+    """Sizes of the attitude and the rate part of a derivative, at least the natural sizes."""
     length = [np.sqrt(np.sum(part**2)) for part in (exact[:4], exact[4:])]
     return max(length[0], np.longdouble(1)), max(length[1], rate)
 
@@ -167,7 +171,7 @@ def _forward_error(found, exact, rate):
     for a, e in zip(np.asarray(found).astype(np.longdouble), exact, strict=True):
         attitude, rates = _sizes(e, rate)
         errors += [_relative(a[:4] - e[:4], attitude), _relative(a[4:] - e[4:], rates)]
-    return np.max(errors)  # keeps NaN
+    return np.max(errors)  # NaN propagates, unlike in max()
 
 
 def _reverse_error(found, exact, weight, rate):
@@ -181,7 +185,7 @@ def _reverse_error(found, exact, weight, rate):
 
 
 def worst(scores: list[dict]) -> dict[str, dict]:
-    """Per family the largest of each error (NaN wins) and the body it belongs to."""
+    """For each family the largest of each error (NaN counts as largest), and the body."""
     found = {}
     for score in scores:
         entry = found.setdefault(score["family"], {"bodies": 0})
@@ -194,7 +198,9 @@ def worst(scores: list[dict]) -> dict[str, dict]:
 
 
 def table(result: dict) -> list[dict]:
-    """Per dtype and family the largest of each error and the body of the largest derivative's."""
+    """For each dtype and family the largest of each error, and the body with the largest error of
+    the derivatives.
+    """
     lines = []
     for dtype, scores in result.items():
         for family, entry in worst(scores).items():
@@ -213,7 +219,7 @@ def table(result: dict) -> list[dict]:
 
 
 def draw(report: dict, path: Path) -> None:
-    """Every body's errors by family, from the JSON; the worst are ringed."""
+    """Draw the errors of all bodies by family from the JSON file; rings mark the largest."""
     from matplotlib.figure import Figure
 
     result = report["numbers"]["bodies"]

@@ -1,7 +1,7 @@
-"""The bodies of the stress suite: families of awkward inertias, states and horizons, as data.
+"""The bodies of the stress suite: families of extreme inertias, states and horizons, as data.
 
-Nothing here is computed by the library. Inputs are exact in float32 where the family allows it, so
-that the same truth serves both precisions (``fits_single``).
+Nothing here is computed by the package. Where possible, inputs are exact in float32, so that the
+same reference applies to both precisions (``fits_single``).
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 
 START = (0.5, -0.125, 0.75, 0.5)
 RATES = (0.7, -0.9, 1.1)
-ANGLE = 5.0  # turned by most bodies [rad], or the phase of their nutation where that is faster
+ANGLE = 5.0  # rotation angle of most bodies [rad], or phase of the nutation if it is faster
 # Directions of the derivatives: relative changes of the inertia; changes of attitude, rates, time.
 INERTIA_MOVE = (0.5, -0.75, 0.25, 0.125, -0.25, 0.375)
 START_MOVE = (0.25, 0.5, -0.125, 0.25)
@@ -24,10 +24,10 @@ TIME_MOVE = 0.125
 class Body:
     """Inputs of one motion.
 
-    ``kind``: "diagonal" (3 moments), "tensor" (xx, yy, zz, xy, xz, yz), "axisymmetric"
-    (transverse, axial), "spherical" (one moment), "euler" (3 moments; ``start`` holds the angles
-    phi, theta, psi and ``rates`` their rates). Otherwise ``start`` is wxyz, ``rates`` those of the
-    body. ``long``: the truth goes by whole periods.
+    ``kind``: "diagonal" (3 moments), "tensor" (xx, yy, zz, xy, xz, yz), "axisymmetric" (transverse,
+    axial), "spherical" (one moment), "euler" (3 moments; ``start`` contains the angles phi, theta,
+    psi and ``rates`` their rates). For the other kinds ``start`` is wxyz and ``rates`` are the body
+    rates. ``long``: the reference is computed by whole periods.
     """
 
     family: str
@@ -45,7 +45,7 @@ class Body:
 
     @property
     def fits_single(self) -> bool:
-        """Whether float32 holds the inputs and has room for their products."""
+        """Whether float32 represents the inputs exactly and their products do not overflow."""
         x = np.array(self.inputs)
         size = np.abs(x)
         least = np.full(len(x), 1e-18)
@@ -55,7 +55,7 @@ class Body:
         return bool(np.all((size == 0) | held & (np.where(held, x, 0).astype(np.float32) == x)))
 
     def moves(self) -> list[list[float]]:
-        """Two directions in the space of ``inputs``: of the inertia, and of all the rest."""
+        """Two directions in the space of ``inputs``: of the inertia, and of all other inputs."""
         size = math.hypot(*self.rates) if max(map(abs, self.rates)) > 0 else 1.0
         zero = [0.0] * len(self.inertia)
         if self.kind == "tensor":
@@ -81,7 +81,7 @@ def single(values) -> tuple:
 def nutation(moments, rates) -> tuple[float, float]:
     """Frequency and parameter m of the elliptic functions, in the arithmetic of the arguments."""
     (a, u), (b, v), (c, w) = sorted(zip(moments, rates, strict=True), key=lambda x: x[0])
-    # A difference of moments stands before each square: no cancellation but the separatrix's own.
+    # Each square has a difference of moments as factor: only the separatrix causes cancellation.
     above = a * u * u * (b - a) - c * w * w * (c - b)  # 2 E I2 - L^2
     outer = b * v * v * (b - a) + c * w * w * (c - a)  # L^2 - 2 E I1
     inner = a * u * u * (c - a) + b * v * v * (c - b)  # 2 E I3 - L^2
@@ -97,7 +97,7 @@ def nutation(moments, rates) -> tuple[float, float]:
 def duration(moments, rates, angle: float = ANGLE) -> float:
     size = max(map(abs, rates)) or 1.0
     scaled = [x / size for x in rates]
-    if max(moments) > 1e100:  # the time depends on their ratios alone, their products overflow
+    if max(moments) > 1e100:  # products would overflow; the time depends on ratios only
         moments = [x / max(moments) for x in moments]
     energy = sum(i * w * w for i, w in zip(moments, scaled, strict=True))
     fast = max(math.hypot(*scaled), math.sqrt(energy / min(moments)))
@@ -120,7 +120,7 @@ def turned_tensor(moments, wxyz) -> tuple:
 
 class _List(list):
     def add(self, family, name, moments, rates, t=None, exact=False, **more) -> None:
-        """``exact``: the inputs lose their point when rounded to float32."""
+        """``exact``: do not round the inputs to float32, which would remove the special case."""
         if not exact:
             moments, rates = single(moments), single(rates)
         t = duration(moments, rates) if t is None else t
@@ -132,7 +132,7 @@ class _List(list):
 
 
 def bodies() -> list[Body]:
-    """All families; the order is that of the report."""
+    """All families, in the order of the report."""
     made = _List()
     _inertias(made)
     _states(made)
@@ -189,7 +189,7 @@ def _inertias(made: _List) -> None:
 
 
 def _states(made: _List) -> None:
-    # On the separatrix I3 w3^2 (I3 - I2) = I1 w1^2 (I2 - I1): exactly so for these numbers.
+    # These numbers are exactly on the separatrix: I3 w3^2 (I3 - I2) = I1 w1^2 (I2 - I1).
     moments = (1.0, 2.0, 2.25)
     made.add("separatrix", "exactly", moments, (0.75, 0.5, 1.0))
     made.add("separatrix", "exactly, not passing the middle", moments, (0.75, 0.0, 1.0))
@@ -205,7 +205,7 @@ def _states(made: _List) -> None:
             rates[axis] = -1.25
             name = f"axis {axis}, off {off:g}"
             made.add("axes", name, (1.0, 2.0, 3.0), rates, exact=0 < off < 1e-37)
-    # Long at the unstable axis, where neighbours part by nine decades (four in single precision).
+    # Near the unstable axis until deviations grow by nine decades (four in single precision).
     for off in (0.0, 1e-14, 1e-8, 1e-4):
         for lowest, t, exact in ((2.1, 22.0, True), (2.0, 10.0, False)):
             for rates in ((off, 2.0, 0.0), (0.0, -2.0, off)):

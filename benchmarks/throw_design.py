@@ -1,10 +1,11 @@
-"""Which throw tells most: ``throw_information`` over initial spins and wheel programs.
+"""Information of throws: ``throw_information`` over initial spins and programmes of the wheel.
 
-A body of 10 times the inertia of the TU Delft device, its wheel, window and noise
-(``benchmarks.throws_synthetic``). The number shown is ``exp(-log det / 12)``: the geometric mean of
-the standard deviations that a single throw leaves of the tensor, over half its trace. By direction
-of a spin of 18 rad/s (angle from the wheel's axis, and about it), the wheel as thrown; and by when
-the wheel is switched on and for how long, for the spin of 18 rad/s that tells most.
+A body with 10 times the inertia of the TU Delft device, with its wheel, window and noise
+(``benchmarks.throws_synthetic``). The result is ``exp(-log det / 12)``: the geometric mean of the
+standard deviations of the tensor after a single throw, relative to half its trace. It is computed
+by direction of a spin of 18 rad/s (angle from the wheel's axis, and about it) with the wheel's
+actual programme; and, for the most informative of these spins, by start and duration of the wheel's
+acceleration.
 
     python -m benchmarks.throw_design [--side 24]
 """
@@ -28,7 +29,7 @@ jax.config.update("jax_enable_x64", True)
 TENSOR = jnp.asarray(10 * study.DEVICE)
 SIZE = float(np.trace(TENSOR)) / 2
 TIMES = study.STEP * np.arange(0, 481, 4)
-# of residuals of one sample of 4 ms
+# noise of a residual, for one sample of 4 ms
 NOISE = Noise(
     *(jnp.asarray(x) for x in (2e-3, 3e-3, 0.01 * SIZE, 1e-4 * SIZE, 0.25 * SIZE, 0.05, 0.5))
 )
@@ -37,18 +38,20 @@ SPIN = 18.0
 
 
 def spread(omega, wheel):
-    """Geometric mean of the standard deviations of the tensor's entries, relative."""
+    """Geometric mean of the relative standard deviations of the tensor's entries."""
     found = throw_information(TENSOR, omega, jnp.asarray(TIMES), wheel, INSTRUMENT, NOISE)
     return jnp.exp(-jnp.linalg.slogdet(found)[1] / 12)
 
 
 def direction(tilt, turn):
-    """Unit vector at ``tilt`` from the wheel's axis, rad."""
+    """Unit vector at ``tilt`` [rad] from the wheel's axis."""
     return jnp.stack([jnp.sin(tilt) * jnp.cos(turn), jnp.sin(tilt) * jnp.sin(turn), jnp.cos(tilt)])
 
 
 def program(begin, length):
-    """-200 rad/s, towards -1300 from ``begin`` on, and back after ``length``, s."""
+    """Speed of the wheel: -200 rad/s, towards -1300 from ``begin`` [s] on, and back after
+    ``length`` [s].
+    """
     t = jnp.asarray(TIMES)
     first = 1 - jnp.exp(-jnp.maximum(t - begin, 0) / 0.03)
     last = 1 - jnp.exp(-jnp.maximum(t - begin - length, 0) / 0.03)
@@ -56,7 +59,7 @@ def program(begin, length):
 
 
 def table(function, rows, columns):
-    """``function`` of all pairs, one after the other."""
+    """Values of ``function`` at all pairs, computed sequentially."""
     pairs = jnp.stack(jnp.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
     found = jax.jit(lambda pairs: jax.lax.map(lambda p: function(*p), pairs))(pairs)
     return np.asarray(found).reshape(len(rows), len(columns))

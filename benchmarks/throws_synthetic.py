@@ -1,12 +1,12 @@
-"""Simulated throws: is a single throw's inertia unbiased, as sure as it can be, and honest?
+"""Simulated throws: bias, efficiency and coverage of the inertia of single throws.
 
-Bodies of 1 to 30 times the inertia of the TU Delft device (``benchmarks.throws``), thrown with the
-same wheel, window, noise of the gyroscope and of the wheel, and torques of the air. The noise is
-found from 40 throws of a body together (``fit_balance``), then every throw is fitted alone; then
-some more, each of which has to tell its noise as well. Printed
-for each size and principal moment: mean error over its standard deviation, root mean square of the
-errors over the Cramer-Rao bound (the standard deviation that the fit states), and how often the
-interval of 95 % holds the truth.
+Bodies of 1 to 30 times the inertia of the TU Delft device (``benchmarks.throws``) are thrown with
+the same wheel, window, noise of gyroscope and wheel, and aerodynamic torques. The noise levels are
+estimated from 40 throws of a body together (``fit_balance``), then every throw is fitted alone with
+these levels; in further throws the noise is estimated from the same single throw. For each size and
+principal moment the output contains the mean error over its standard deviation, the rms error over
+the Cramer-Rao bound (the standard deviation that the fit states), and the coverage of the 95 %
+intervals.
 
     python -m benchmarks.throws_synthetic [--throws 960] [--own 240] [--sizes 1,3,10,30]
 """
@@ -28,19 +28,19 @@ from benchmarks.throws import Instrument, fit_balance, fit_each
 from polhode import fit as room
 
 SPIN = 1.7e-6
-# of the device with its wheel locked, kg m^2, as benchmarks.throws finds it, rounded
+# tensor of the device with its wheel locked [kg m^2]: the rounded result of benchmarks.throws
 DEVICE = 1e-6 * np.array([[78.0, 3.0, 2.0], [3.0, 24.0, -2.0], [2.0, -2.0, 91.0]])
 STEP, LENGTH, BLOCK = 1e-3, 0.48, 4
-# of a sample of 1 ms: rad/s of the gyroscope, at rest and what the fastest wheel adds; of the wheel
+# noise of a sample of 1 ms [rad/s]: gyroscope at rest, addition at full wheel speed; wheel
 GYRO, STIRRED, WHEEL = 4e-3, 6e-3, 1.0
-# over half the trace of the tensor: white torque, rad/s^(3/2), slow one, rad/s^2, and its memory, s
+# torques over half the trace: white [rad/s^(3/2)], slow [rad/s^2], correlation time [s]
 WHITE, SLOW, MEMORY = 0.01, 0.25, 0.05
-# drag over half the trace: 1/s, 1/rad
+# drag over half the trace [1/s, 1/rad]
 LINEAR, QUADRATIC = 0.01, 1e-3
 
 
 def speed(t):
-    """Of the wheel: -200 rad/s, -1300 from 0.1 s on, and back from 0.3 s on."""
+    """Speed of the wheel: -200 rad/s, towards -1300 from 0.1 s on, and back from 0.3 s on."""
     first = 1 - jnp.exp(-jnp.maximum(t - 0.1, 0) / 0.03)
     last = 1 - jnp.exp(-jnp.maximum(t - 0.3, 0) / 0.03)
     return -200 - 1100 * first + 1100 * last
@@ -86,7 +86,7 @@ def simulated(key, tensor, parts=4):
 
 
 def throws(seed, tensor, number):
-    """Recordings; speeds of the wheel just after its motor is switched are left out."""
+    """Recordings, without wheel speeds just after the motor is switched."""
     keys = jax.random.split(jax.random.key(seed), number)
     readings, wheels = jax.jit(jax.vmap(simulated, in_axes=(0, None)))(keys, jnp.asarray(tensor))
     times = STEP * np.arange(readings.shape[1])
@@ -101,8 +101,8 @@ def throws(seed, tensor, number):
 def study(size, number, together=40, group=120):
     """Errors of single throws of a body of ``size`` times the device's inertia.
 
-    The noise is found anew for every ``group`` of throws, from its first ``together``: what the
-    throws of a group have in common is then seen as well.
+    The noise is estimated again for every ``group`` of throws, from its first ``together``, so that
+    the errors include those of the noise levels, which the throws of a group share.
     """
     tensor = size * DEVICE
     true = np.linalg.eigvalsh(tensor)
@@ -124,7 +124,7 @@ def study(size, number, together=40, group=120):
 
 
 def study_own(size, number):
-    """Errors of single throws that tell their noise as well."""
+    """Errors of single throws whose noise is estimated from the same throw."""
     tensor = size * DEVICE
     true = np.linalg.eigvalsh(tensor)
     fits = [
@@ -142,7 +142,7 @@ def study_own(size, number):
 
 
 def told(error, spread, true):
-    """What errors (n, 3) and the deviations stated say together."""
+    """Statistics of the errors (n, 3) and of the stated standard deviations."""
     off = error / spread
     held = np.abs(off) < 1.959964
     return {

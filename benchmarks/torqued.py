@@ -1,14 +1,14 @@
-"""Asked and reached: what ``method=None`` makes of its ``rtol`` where something acts on the body.
+"""Requested and actual errors of ``method=None`` for scenes with potentials, torques or wheels.
 
     python -m benchmarks.torqued [SCENE ...] [--quick] [--output out/benchmarks/torqued.json]
 
-Every class of potential, torque and rotor, alone and several at once, on 24 bodies that share
-nothing: needles, discs, near-spheres and ordinary ones, rates between 1/32 and 8 rad/s, in one
-batch and (four of them) one at a time; horizons from 0.25 s to 1,000 s (128 s where a torque spins
-bodies up); float64 and float32. Truth: Newton-Euler's equations written out in
-benchmarks/torqued_truth.py and integrated by heyoka's Taylor method in 80-bit numbers. Bodies whose
-final attitude depends on the start more than ``WILD`` times as strongly as a free turn's are
-counted apart: no method can keep them.
+Every class of potential, torque and rotor, alone and in combination, on 24 different bodies:
+needles, discs, near-spheres and ordinary ones, with rates between 1/32 and 8 rad/s, in one batch
+and (four of them) one at a time; horizons from 0.25 s to 1,000 s (128 s where a torque spins bodies
+up); float64 and float32. The reference is Newton-Euler's equations in benchmarks/torqued_truth.py,
+integrated by heyoka's Taylor method in 80-bit arithmetic. Bodies whose final attitude depends on
+the initial state more than ``WILD`` times as strongly as that of free rotation are counted
+separately, because no method can bound their error.
 """
 
 import argparse
@@ -33,7 +33,7 @@ ALONE = (0, 7, 14, 21)
 
 
 def scene_of(name: str, moments, dtype) -> ph.Scene:
-    """The scene as a user would state it."""
+    """The scene as a user would construct it."""
 
     def a(*x):
         return jnp.asarray(x if len(x) > 1 else x[0], dtype)
@@ -74,7 +74,7 @@ def scene_of(name: str, moments, dtype) -> ph.Scene:
 
 
 def error_of(wxyz, exact) -> np.ndarray:
-    """Angles [rad] between attitudes (n, 4) and the truth; NaN where there is none."""
+    """Angles [rad] between attitudes (n, 4) and the reference; NaN if there is none."""
     q, exact = np.asarray(wxyz, np.longdouble), np.asarray(exact)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     gap = np.minimum(*(np.linalg.norm(q - s * exact, axis=-1) for s in (1, -1)))
@@ -100,7 +100,8 @@ def reached(name, dtype, horizons, tolerances) -> list[dict]:
     for horizon in horizons:
         exact, growth, turned = torqued_truth.truth(name, horizon)
         for rtol in tolerances:
-            floor = 4 * np.finfo(dtype).eps * turned**1.5  # rounding wanders, the phase sums it
+            # rounding: a random walk of the momentum, which the phase integrates
+            floor = 4 * np.finfo(dtype).eps * turned**1.5
             for kind in ("batch", "alone"):
                 which = everyone if kind == "batch" else np.array(ALONE)
                 if kind == "batch":
@@ -135,9 +136,11 @@ def reached(name, dtype, horizons, tolerances) -> list[dict]:
 
 
 def over_tolerance(rows: list[dict]) -> list[dict]:
-    """One row for each scene, dtype and tolerance: errors over the larger of ``rtol`` and
-    rounding. The largest median of all horizons; the worst body by horizon; the fewest bodies that
-    count, of those in the batch; how often a body was flagged."""
+    """One row for each scene, dtype and tolerance: errors over the larger of ``rtol`` and rounding.
+
+    The columns are the largest median over all horizons, the largest error by horizon, the smallest
+    number of bodies in the batch that count, and the number of flagged bodies.
+    """
     groups: dict[tuple, list[dict]] = {}
     for row in rows:
         groups.setdefault((row["scene"], row["dtype"], row["rtol"]), []).append(row)
@@ -179,7 +182,7 @@ def main() -> None:
             if options.quick and dtype == "float32":
                 continue
             horizons = HORIZONS[1:3] if options.quick else HORIZONS
-            if "torque" in name:  # half a million radians later, rounding is all there is
+            if "torque" in name:  # after half a million radians only rounding is left
                 horizons = [h for h in horizons if h < 1000]
             tolerances = TOLERANCES[dtype]
             rows += (new := reached(name, dtype, horizons, tolerances))
@@ -188,7 +191,7 @@ def main() -> None:
                     "  ".join(f"{v:.2g}" if isinstance(v, float) else f"{v}" for v in row.values()),
                     flush=True,
                 )
-        jax.clear_caches()  # the programs of all scenes at once do not fit
+        jax.clear_caches()  # all programs together would not fit into memory
         numbers = {"rows": rows, "over_tolerance": over_tolerance(rows)}
         path = _report.write("torqued", numbers, path=options.output, packages=("heyoka",))
     print(path)

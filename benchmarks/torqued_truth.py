@@ -1,12 +1,12 @@
-"""Bodies and scenes of benchmarks/torqued.py, and their motion in 80-bit numbers by heyoka.
+"""Bodies and scenes of benchmarks/torqued.py, and their motion in 80-bit arithmetic by heyoka.
 
-Newton-Euler's equations are written out by hand for every scene, with w the body rates, q the
-attitude (body -> space), I = diag(moments), K the inertia without wheels that turn freely, h what
-the wheels carry along their axes a beyond it:
+Newton-Euler's equations are written by hand for every scene, with the body rates w, the attitude q
+(body -> space), I = diag(moments), the inertia K without freely spinning wheels, and the momentum h
+that wheels have along their axes a in addition to that of K:
 
     K dw/dt = (K w + h a) x w + N - a dh/dt,    dq/dt = q (0, w) / 2.
 
-All numbers are multiples of powers of two that single precision holds.
+All numbers are multiples of powers of two that single precision represents.
 """
 
 from functools import cache
@@ -48,14 +48,14 @@ MOMENTS = np.array([_SHAPES[i % 4] for i in range(BODIES)])
 
 
 def axisymmetric(moments):
-    """Transverse moments made equal."""
+    """The moments with equal transverse ones."""
     moments = np.array(moments)
     moments[..., 1] = moments[..., 0]
     return moments
 
 
 def states(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Attitudes and rates, which float32 holds; the rates' sizes lie between 1/32 and 8 rad/s."""
+    """Attitudes and rates, exact in float32; the rates have sizes between 1/32 and 8 rad/s."""
     draws = np.random.default_rng(41).standard_normal((BODIES, 7))
     wxyz = draws[:, :4] / np.linalg.norm(draws[:, :4], axis=1, keepdims=True)
     axis = draws[:, 4:] / np.linalg.norm(draws[:, 4:], axis=1, keepdims=True)
@@ -64,7 +64,7 @@ def states(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _equations(name: str):
-    """System of heyoka, moments as parameters, and further initial values."""
+    """heyoka's system, with the moments as parameters, and additional initial values."""
     import heyoka as hy
 
     w, x, y, z, *o = hy.make_vars("w", "x", "y", "z", "a", "b", "c")
@@ -167,7 +167,7 @@ def _integrator(name: str):
 
 
 def motion(name: str, moments, wxyz, omega, times) -> np.ndarray:
-    """States (wxyz, omega) at the times of one body, 80-bit."""
+    """States (wxyz, omega) of one body at the times, in 80 bits."""
     made, start = _integrator(name)
     q = np.asarray(wxyz, LONG)
     omega = np.asarray(omega, LONG)
@@ -185,9 +185,10 @@ def motion(name: str, moments, wxyz, omega, times) -> np.ndarray:
 
 
 def truth(name: str, horizon: float):
-    """Attitudes (bodies, 4) in 80 bits, growth of a small change of the start, angle turned.
+    """Attitudes (bodies, 4) in 80 bits, growth of a small change of the start, rotation angle.
 
-    The growth is relative to the angle turned: 1 for a free turn, whose phase drifts.
+    The growth is relative to the rotation angle: 1 for free rotation, whose phase error grows
+    linearly.
     """
     file = _report.OUT / "truth" / f"{name.replace(' ', '_').replace(',', '')}.npz"
     if not file.exists():

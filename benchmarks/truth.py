@@ -1,15 +1,15 @@
-"""Truth of the comparison: Taylor series in fixed-point arithmetic of 40 digits.
+"""Reference solutions of the problems: Taylor series in fixed-point arithmetic of 40 digits.
 
     python -m benchmarks.truth [--check]
 
-makes benchmarks/truth/<problem>.npz for the first bodies of every problem: attitude and rates at
-some of the saved times, rounded to float64. Nothing of the package and no elliptic function is
-used: Euler's equations, the quaternion and the direction of the field in body axes are expanded in
-time, with the step taken from the last coefficients. A free body over a long time is carried over
-whole periods of its rates (the period from mpmath's complete elliptic integral, proved by the
-rates' return), each of which turns it by the same angle about its angular momentum.
+writes benchmarks/truth/<problem>.npz for the first bodies of every problem: attitude and rates at
+some of the saved times, rounded to float64. Neither the package nor elliptic functions are used:
+Euler's equations, the quaternion and the direction of the field in body axes are expanded in time,
+and the step follows from the last coefficients. A free body over a long time is propagated by whole
+periods of its rates, each of which rotates it by the same angle about its angular momentum. The
+period is mpmath's complete elliptic integral, and is verified by the return of the rates.
 
-``--check`` makes the first two bodies of each with 10 more digits and compares.
+``--check`` computes the first two bodies of each problem with 10 more digits and compares.
 """
 
 import argparse
@@ -38,12 +38,12 @@ def truth(problem: Problem) -> dict[str, np.ndarray]:
 
 
 def saved(problem: Problem) -> np.ndarray:
-    """Which of the saved times are scored: ten at most."""
+    """Indices of the saved times that are scored: at most ten."""
     return np.unique(np.ceil(np.arange(1, 11) * problem.saves / 10).astype(int)) - 1
 
 
 def make(problem: Problem, bodies: int = BODIES, digits: int = DIGITS) -> dict[str, np.ndarray]:
-    """Compute what ``truth`` reads."""
+    """Compute the files that ``truth`` reads."""
     index = saved(problem)
     times = problem.times[1:][index]
     wxyz, omega = problem.states(bodies)
@@ -54,9 +54,9 @@ def make(problem: Problem, bodies: int = BODIES, digits: int = DIGITS) -> dict[s
 
 
 def motion(problem: Problem, wxyz, omega, times, digits: int = DIGITS, moments=None) -> list[list]:
-    """States (wxyz, omega) at the times, as mpmath numbers; floats are taken as exact.
+    """States (wxyz, omega) at the times, as mpmath numbers; floats are treated as exact.
 
-    ``moments``: other moments of inertia than the problem's, as mpmath numbers.
+    ``moments``: moments of inertia that replace those of the problem, as mpmath numbers.
     """
     import mpmath as mp
 
@@ -117,7 +117,7 @@ class _Series:
         if gradient:
             self.gradient = [gradient * (c - b) / a, gradient * (a - c) / b, gradient * (b - a) / c]
         self.drag, self.push = None, [mp.mpf(0)] * 3  # over the moments
-        self.unit = mp.mpf(1) / 4  # of time; follows the motion
+        self.unit = mp.mpf(1) / 4  # of time; adapted to the motion
 
     def advance(self, state, span):
         """The state after ``span`` [s]."""
@@ -128,7 +128,7 @@ class _Series:
             size = mp.ldexp(mp.mpf(last), -self.bits)
             limit = mp.mpf(10) ** -(self.digits + 2)
             share = mp.mpf(2) if size == 0 else (limit / size) ** (mp.mpf(1) / self.order)
-            if share < mp.mpf(1) / 2:  # the coefficients have outgrown the fixed point
+            if share < mp.mpf(1) / 2:  # the coefficients exceed the range of the fixed point
                 self.unit = self.unit * share
                 continue
             step = min(share * self.unit, self.unit, span)
@@ -146,7 +146,7 @@ class _Series:
         return int(self.mp.nint(self.mp.ldexp(value, self.bits)))
 
     def _coefficients(self, state, unit):
-        """Series of the ten components in units of time ``unit``, fixed point."""
+        """Fixed-point Taylor coefficients of the ten components, in units of time ``unit``."""
         bits, fixed = self.bits, self._fixed
         rows = [[fixed(x)] for x in state]
         q0, q1, q2, q3, x, y, z, a, b, c = rows
@@ -196,7 +196,7 @@ def _horner(row, x, bits):
 
 
 def _long(moments, q, w, t, digits):
-    """A free body over many periods of its rates."""
+    """Propagate a free body over many periods of its rates."""
     import mpmath as mp
 
     body = _Series(moments, mp.mpf(0), mp.mpf(0), digits)
@@ -206,7 +206,7 @@ def _long(moments, q, w, t, digits):
     once = body.advance([*q, *w, *zero], period)
     if max(abs(a - b) for a, b in zip(once[4:7], w)) > mp.mpf(10) ** (4 - digits):
         raise ArithmeticError("the rates did not return after one period")
-    # the attitude of one period later is a turn in space times the attitude, the same each time
+    # each period multiplies the attitude by the same rotation in space
     turn = _multiply(once[:4], [q[0], -q[1], -q[2], -q[3]])
     half = mp.atan2(mp.sqrt(mp.fdot(turn[1:], turn[1:])), turn[0])
     axis = [x / mp.sqrt(mp.fdot(turn[1:], turn[1:])) for x in turn[1:]]
@@ -221,7 +221,7 @@ def _period(moments, w):
     order = sorted(range(3), key=lambda k: moments[k])
     a, b, c = (moments[k] for k in order)
     x, y, z = (w[k] for k in order)
-    # L^2 - 2 T I of the outer axes, without cancellation
+    # L^2 - 2 T I of the smallest and largest axes, without cancellation
     low = b * (b - a) * y**2 + c * (c - a) * z**2
     high = a * (c - a) * x**2 + b * (c - b) * y**2
     first, second = (b - a) * high, (c - b) * low
@@ -244,10 +244,10 @@ def _multiply(p, q):
 def slopes(
     problem: Problem, bodies: int, weights: tuple, digits: int = 40, by: str = "moments"
 ) -> np.ndarray:
-    """Exact derivatives (bodies, k) of ``weights . (wxyz, omega)`` at the end.
+    """Derivatives (bodies, k) of ``weights . (wxyz, omega)`` at the end, exact to float64.
 
     ``by``: the three moments, the ``state`` (seven numbers) or the ``weight``. Central differences
-    of step 1e-14 in ``digits`` digits.
+    with a step of 1e-14 in arithmetic of ``digits`` digits.
     """
     import mpmath as mp
 

@@ -1,10 +1,11 @@
-"""Error against run time of polhode and its peers on families of rigid bodies.
+"""Error against run time of polhode and other programs on families of rigid bodies.
 
     python -m benchmarks.work_precision [FAMILY ...] [--quick] [--output out/work_precision.json]
 
-Families: benchmarks/problems.py; peers: benchmarks/peers; truth: benchmarks/truth.py. One thread
-on one core. Every program of a table moves the same bodies and is timed in turn with the others;
-compiling is apart. ``--quick`` takes fewer tolerances, bodies and families (under three minutes).
+Families: benchmarks/problems.py; other programs: benchmarks/peers; references: benchmarks/truth.py.
+One thread on one core. All programs of a table simulate the same bodies and are timed alternately;
+compilation is listed separately. ``--quick`` uses fewer tolerances, bodies and families (under
+three minutes).
 """
 
 import argparse
@@ -83,15 +84,15 @@ def table(family, n, dtype, tolerances, quick, repeats=7, budget=1.0) -> list[di
 
 
 def is_default(row: dict) -> bool:
-    """Whether a row is of the method that polhode chooses."""
+    """Whether a row is that of the method that polhode chooses."""
     return row["peer"] == OURS and row["program"].startswith("default")
 
 
 def time_at(rows: list[dict], level: float, error: str = "attitude_median") -> float | None:
-    """Time [ns per body] of one program to reach an error; None where it never does.
+    """Time [ns per body] of one program to reach an error; None if it does not reach it.
 
-    Interpolated between neighbouring settings on logarithmic scales, never extrapolated: where all
-    settings are better than requested, the cheapest one counts.
+    Times are interpolated between neighbouring settings on logarithmic scales, never extrapolated:
+    if all settings are more accurate than requested, the cheapest one counts.
     """
     points = [
         (max(row[error], 1e-17), row["ns_per_body"])
@@ -111,9 +112,10 @@ def time_at(rows: list[dict], level: float, error: str = "attitude_median") -> f
 
 
 def time_to_error(tables: list[dict], error: str = "attitude_median") -> list[dict]:
-    """Per table and peer: time [us per body] of its best program to each error, the best error,
-    and the longest compilation. polhode: of the default alone, whose method may change with the
-    tolerance."""
+    """Per table and program: time [us per body] of its best method to each error, its smallest
+    error, and the longest compilation. For polhode, only the default counts, whose method may
+    change with the tolerance.
+    """
     found = []
     for entry in tables:
         programs: dict[str, dict[str, list[dict]]] = {}
@@ -137,8 +139,9 @@ def time_to_error(tables: list[dict], error: str = "attitude_median") -> list[di
 
 
 def fastest_peer(lines: list[dict]) -> list[dict]:
-    """Per table and error, from the lines of ``time_to_error``: the fastest peer, and its time over
-    that of polhode's default."""
+    """Per table and error, from the rows of ``time_to_error``: the fastest other program, and its
+    time over that of polhode's default.
+    """
     tables: dict[tuple, list[dict]] = {}
     for line in lines:
         tables.setdefault((line["scene"], line["bodies"], line["dtype"]), []).append(line)
@@ -162,7 +165,7 @@ def fastest_peer(lines: list[dict]) -> list[dict]:
 
 
 def default_errors(tables: list[dict]) -> list[dict]:
-    """What polhode's default reaches where it integrates, beside its tolerance."""
+    """Tolerance and error of polhode's default where it integrates."""
     return [
         {
             "scene": entry["title"],
@@ -250,7 +253,7 @@ def main() -> None:
 
 
 def written(options, installed, missing, tables) -> Path:
-    """Write what there is so far."""
+    """Write the results so far."""
     packages = tuple(p for module in installed.values() for p in module.PACKAGES)
     numbers = {"quick": options.quick, "missing": missing, "tables": tables, **derived(tables)}
     return _report.write("work_precision", numbers, path=options.output, packages=packages)

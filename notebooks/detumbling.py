@@ -13,10 +13,11 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/detumbling.ipynb)
 #
-# A small satellite tumbles after its release. Three magnetorquers detumble it in the field of the
-# Earth by the B-dot law: their moment is `k` times $\omega\times B$. With a small gain `k` this
-# takes long. With a large one only the rate normal to the field is damped, until the direction of
-# the field has changed. The best gain lies between; the derivative of the simulation finds it.
+# A small satellite tumbles after its release. Three magnetorquers damp its rotation in the Earth's
+# magnetic field by the B-dot law: their moment is `k` times $\omega\times B$. With a small gain `k`
+# this takes a long time. A large gain damps only the rate normal to the field, until the direction
+# of the field has changed. The best gain is in between; the derivative of the simulation determines
+# it.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -74,12 +75,12 @@ plt.show()
 
 # %% [markdown]
 # ## The loss and its derivative
-# Not every loss can be tuned by a derivative. Near the best gain the energy at the end of the orbit
-# varies by orders of magnitude, and the energy of a single satellite jumps with the gain, because
-# its motion passes close to the separatrix. The mean kinetic energy over the
-# orbit and over 32 directions of the first rate is smooth where the best gain lies. With one
-# parameter, forward mode (`jax.jvp`) costs least. The derivative with respect to `log k` passes
-# through orbit, field, control law and motion; here it is compared with central differences.
+# Not every loss is suitable for gradient-based tuning. Near the best gain the energy at the end of
+# the orbit varies by orders of magnitude, and the energy of a single satellite varies abruptly with
+# the gain, because its motion passes close to the separatrix. The mean kinetic energy over the
+# orbit and over 32 directions of the initial rate is smooth near the best gain. For a single
+# parameter, forward mode (`jax.jvp`) is cheapest. The derivative with respect to `log k` includes
+# orbit, field, control law and motion; here it is compared with central differences.
 
 # %%
 directions = np.random.default_rng(0).normal(size=(32, 3))
@@ -137,8 +138,8 @@ right.legend(title="A m² s/T")
 plt.show()
 
 # %% [markdown]
-# This gain is the best one for these rates and this orbit. Real magnetorquers saturate:
-# `ph.BDot(k, max_moment=...)` limits them, and derivatives pass through the limit.
+# This gain is optimal for these rates and this orbit. Real magnetorquers saturate:
+# `ph.BDot(k, max_moment=...)` limits their moment, and derivatives take the limit into account.
 #
 # ## Pointing
 # Once the rates are small, reaction wheels take over: three motors with limits control the attitude

@@ -17,7 +17,7 @@
 # rigid body is a quadratic form, $H=\tfrac12\,p\cdot V(q)\,p$. Hamilton's equations are
 # $\dot q = Vp$, $\dot p_\varphi=0$, $\dot p_\theta=p\cdot\Theta p$, $\dot p_\psi=p\cdot\Psi p$,
 # with matrices that are long when written out. In polhode the Hamiltonian is written once, and
-# `jax.grad` derives the equations. Two questions:
+# `jax.grad` derives the equations. This notebook answers two questions:
 #
 # 1. Does automatic differentiation agree with the closed forms?
 # 2. What happens at $\theta=0$ and $\theta=\pi$?
@@ -73,8 +73,9 @@ print("dq/dt     ", rate_q, "\nV p       ", V @ p)
 print("dp/dt     ", rate_p, "\n0, pTp, pPp", jnp.array([0.0, p @ Theta @ p, p @ Psi @ p]))
 
 # %% [markdown]
-# And on 20,000 random states, with the angle $\theta$ down to a thousandth of a radian from a pole.
-# Every deviation is divided by the size of the terms of the closed form.
+# The next cell compares 20,000 random states, some of them within a thousandth of a radian of a
+# pole ($\theta = 0$ or $\pi$). Every deviation is divided by the size of the terms of the closed
+# form.
 
 # %%
 rng = np.random.default_rng(0)
@@ -120,12 +121,13 @@ plt.show()
 # The two agree to rounding.
 #
 # ## 2. The poles
-# At $\theta=0$ the first and the third rotation are about the same axis: only $\varphi+\psi$ is
-# defined. The motion is regular there, but $V$ grows like $1/\sin^2\theta$. When a body passes a
-# pole at distance $\delta$, its angles $\varphi$ and $\psi$ change by about $\pi$ within a time
-# proportional to $\delta$, which an integrator in these coordinates must resolve. Bodies pass the
-# pole at eight distances, computed by three methods: the closed form, quaternion and body momentum,
-# and Euler angles, the latter two with the same solver and tolerance.
+# At $\theta=0$ the first and the third rotation have the same axis: only $\varphi+\psi$ is defined.
+# The motion is regular there, but $V$ grows as $1/\sin^2\theta$. When a body passes a pole at
+# distance $\delta$, its angles $\varphi$ and $\psi$ change by about $\pi$ within a time
+# proportional to $\delta$, which an integrator in these coordinates must resolve. The next cells
+# simulate bodies that pass the pole at eight distances by three methods: the closed form,
+# integration in quaternion and body momentum, and integration in Euler angles, the latter two with
+# the same solver and tolerance.
 
 # %%
 closest = np.logspace(0, -7, 8)
@@ -169,6 +171,6 @@ for name, run in results.items():
           f" finished {int(run.successful.sum())} of {len(closest)}")  # fmt: skip
 
 # %% [markdown]
-# Quaternion and body momentum are not affected by the poles. Euler angles need more steps at every
-# approach. polhode uses them for derivations and tests: `method=None` never chooses them, and the
-# status of the result reports a body that comes too close to a pole.
+# Integration in quaternion and body momentum is not affected by the poles. Euler angles need more
+# steps at every approach. polhode uses them for derivations and tests: `method=None` never selects
+# them, and the status of the result reports a body that comes too close to a pole.

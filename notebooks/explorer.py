@@ -13,9 +13,10 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/explorer.ipynb)
 #
-# On 1 February 1958 Explorer 1, a tube of 2 m, was left spinning at 750 turns a minute about its
-# long axis. Within an orbit it was rotating end over end. No torque acted on it: four whip antennas
-# bent and dissipated energy of the rotation as heat, at constant angular momentum. How much?
+# On 1 February 1958 Explorer 1, a tube of 2 m, was released with a spin of 750 revolutions per
+# minute about its long axis. Within an orbit it was rotating end over end. No torque acted on it:
+# four whip antennas bent and dissipated rotational energy as heat, at constant angular momentum.
+# How much power did they dissipate?
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -51,10 +52,10 @@ print(f"energy {L**2 / (2 * C):.0f} J spinning along, {L**2 / (2 * A):.1f} J end
 
 # %% [markdown]
 # ## A sink, and the angle in closed form
-# `ph.EnergySink(k)` dissipates $k\,|L\times\omega|^2$ watts and keeps $L$ constant in space. With
+# `ph.EnergySink(k)` dissipates $k\,|L\times\omega|^2$ watts at constant $L$ in space. For the angle
 # $\theta$ between the axis and $L$, this body has
-# $\tan\theta=\tan\theta_0\,\exp(kL^2(1/C-1/A)\,t)$. Three rates of dissipation, starting 0.1° off
-# the axis:
+# $\tan\theta=\tan\theta_0\,\exp(kL^2(1/C-1/A)\,t)$. The next cell simulates three rates of
+# dissipation, starting 0.1° from the axis:
 
 # %%
 theta0 = np.deg2rad(0.1)
@@ -85,9 +86,8 @@ print(f"the energy only fell: {bool(jnp.all(jnp.diff(path.energy) < 1e-9))}")
 
 # %% [markdown]
 # ## The loss within one orbit
-# The time is inversely proportional to `k`: half the `k` takes twice the time. From 0.1° to 80° in
-# an orbit of 115
-# minutes:
+# The time to reach an angle is inversely proportional to `k`. The next cell computes the `k` for
+# which the body goes from 0.1° to 80° within one orbit of 115 minutes:
 
 # %%
 orbit = 115 * 60.0
@@ -96,8 +96,8 @@ most = rate * L**2 * (1 / C - 1 / A) / 4  # at 45 degrees
 print(f"growth {rate:.1e} /s; the antennas need to turn at most {most:.3f} W into heat")
 
 # %% [markdown]
-# A few hundredths of a watt. The angle at any time can be differentiated; from an angle observed
-# after a minute, Newton's method on the simulation determines `k`:
+# The power is a few hundredths of a watt. The angle at any time is differentiable; from an angle
+# that was observed after a minute, Newton's method on the simulation determines `k`:
 
 
 # %%
@@ -117,9 +117,9 @@ print(f"growth {float(jnp.exp(x)) * L**2 * (1 / C - 1 / A):.6f} /s, by the formu
 
 # %% [markdown]
 # ## A nutation damper
-# Satellites that should rotate about the axis of their largest moment carry a ring of fluid: a
-# wheel with friction, `ph.Rotor(..., coupling=ph.ViscousCoupling(c))`. It damps the nutation of
-# this disk by exchanging angular momentum with the body.
+# Satellites that should rotate about the axis of their largest moment carry a ring of fluid. It is
+# modelled as a wheel with friction, `ph.Rotor(..., coupling=ph.ViscousCoupling(c))`, which
+# exchanges angular momentum with the body and damps the nutation of this disk.
 
 # %%
 disk = ph.Inertia.from_moments([1.0, 1.1, 1.6])

@@ -15,8 +15,8 @@
 #
 # A box with a gyroscope inside is thrown. It tumbles freely for a second, and the gyroscope records
 # three rates two hundred times a second. What is its inertia? The recording is simulated, so that
-# the answer can be checked: a box of 0.9 kg, 18 x 11 x 4 cm, the sensor mounted askew, white noise
-# of 0.03 rad/s, and seven samples lost.
+# the answer can be checked: a box of 0.9 kg, 18 x 11 x 4 cm, a sensor that is not aligned with the
+# box, white noise of 0.03 rad/s, and seven lost samples.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -66,8 +66,8 @@ print(recording.times.shape[-1], "rows,", int(np.sum(recording.present == 0)), "
 # tensor and the rates at the first sample; every iterate is a possible body. The starting
 # point comes from the data, by linear regression on the conservation of angular momentum.
 #
-# The simulated sensor has exact scale factors and axes, `Gyroscope.ideal()`. Those of a real one
-# are known to a per cent or so, which is the default, and the intervals are wider.
+# The simulated sensor has exact scale factors and axes, `Gyroscope.ideal()`. Those of a real sensor
+# are known to about one per cent, which is the default and leads to wider intervals.
 
 # %%
 options = fit.FitOptions(trust_noise=True, gyroscope=fit.Gyroscope.ideal())
@@ -75,11 +75,11 @@ found = fit.fit_recordings([recording], options=options)
 print(found.report())
 
 # %% [markdown]
-# The report states what the data cannot show. Only *ratios* of moments are determined: a body of
-# twice the inertia moves in the same way. The handedness of the axes is not determined either: with
-# one axis of the sensor inverted, the same data belong to the other body named there. The numbers
-# in brackets are standard deviations, by the Fisher information: no unbiased estimate from these
-# data does better.
+# The report states what the data do not determine. Only *ratios* of moments are determined: a body
+# of twice the inertia moves in the same way. The handedness of the axes is not determined either:
+# with one axis of the sensor inverted, the same data belong to the other body that the report
+# names. The numbers in brackets are standard deviations from the Fisher information: no unbiased
+# estimate from these data has smaller ones.
 
 # %%
 figure = plot.fit(found, recording, title="toss")
@@ -88,7 +88,7 @@ plt.show()
 # %% [markdown]
 # ## Comparison with the truth
 #
-# The simulated box, and the errors of the fit in standard deviations.
+# The next cell compares the fit with the simulated box; errors are in units of standard deviations.
 
 # %%
 true = np.sort(np.asarray(box.tensor).diagonal())
@@ -100,7 +100,7 @@ print("off by       ", off, "standard deviations")
 
 # %% [markdown]
 # The fit also yields the directions of the principal axes in sensor axes, the columns of this
-# matrix. Their uncertainty is given as angles about each axis.
+# matrix. Their uncertainty is stated as a rotation angle about each axis.
 
 # %%
 print(np.asarray(rotation.wxyz_to_matrix(found.axes)))
@@ -109,8 +109,9 @@ print("known to", np.degrees(np.asarray(found.axes_std)), "degrees")
 # %% [markdown]
 # ## How long must a recording be?
 #
-# The bound can be computed before the throw. The residual function is public, and its Jacobian
-# gives the bound for any body and rates; here, the same box with shorter and shorter recordings.
+# The bound on the standard deviations can be computed before the throw. The residual function is
+# public, and its Jacobian determines the bound for any body and rates; here for the same box and
+# shorter and shorter recordings.
 
 # %%
 parameters, model = found.parameters, found.model
@@ -151,16 +152,16 @@ ax.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# At a constant effect per sample a bound falls with the square root of the number of samples. This
-# one falls much faster, because a small error of the inertia grows with time into a large error of
-# phase: a longer recording helps more than a higher sampling rate.
+# If every sample had the same information, the bound would decrease with the square root of the
+# number of samples. It decreases much faster, because a small error of the inertia grows with time
+# to a large error of the phase: a longer recording helps more than a higher sampling rate.
 
 # %% [markdown]
 # ## Absolute size: a reaction wheel
 #
-# Free motion shows ratios. A reaction wheel of known spin inertia, switched on and off in flight,
-# shows the size as well. `SteppedMotion` integrates the motion of body and wheel; the drag of the
-# air and the delay between gyroscope and wheel are estimated with the tensor.
+# Free motion determines only ratios. A reaction wheel of known spin inertia, switched on and off in
+# flight, determines the size as well. `SteppedMotion` integrates the motion of body and wheel; the
+# fit estimates drag and the delay between gyroscope and wheel together with the tensor.
 
 # %%
 rng = np.random.default_rng(3)
@@ -200,5 +201,5 @@ lag = float(sized.parameters.motion["delay"])
 print(f"delay of the gyroscope  {1e3 * lag:.2f} ms, set {1e3 * delay} ms")
 
 # %% [markdown]
-# The accuracy with real instruments and real air:
-# [what a motion shows of the inertia](../docs/identifiability.md).
+# For the accuracy with real instruments and real drag see
+# [what a motion reveals about the inertia](../docs/identifiability.md).

@@ -13,9 +13,9 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/inertia.ipynb)
 #
-# A spacecraft, drawn in its designer's axes, must rotate about z. Whether it can depends on its
-# principal axes. This notebook goes from the parts to the inertia tensor, to its principal axes,
-# and to the motion.
+# A spacecraft, drawn in its designer's axes, is to rotate about z. Whether this is a permanent
+# rotation depends on its principal axes. This notebook computes the inertia tensor from the parts,
+# its principal axes, and the motion, and then balances the spacecraft.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -53,9 +53,9 @@ np.set_printoptions(precision=3, suppress=True)
 # %% [markdown]
 # ## From parts to a tensor
 #
-# A bus, two solar panels at an angle, and a boom with a ball at its tip. Each part is a simple
-# shape, `moved` to its position; `compose` adds masses, finds the common centre of mass and
-# shifts every tensor to it.
+# The spacecraft consists of a bus, two inclined solar panels, and a boom with a ball at its tip.
+# Each part is a simple shape, `moved` to its position; `compose` adds the masses, computes the
+# common centre of mass and shifts every tensor to it.
 
 # %%
 bus_sides, panel_sides = np.array([1.2, 1.0, 0.6]), np.array([1.0, 2.0, 0.04])
@@ -191,9 +191,9 @@ plt.show()
 # %% [markdown]
 # ## The motion
 #
-# Rotating about the designer's z at 6 rpm, the spacecraft tumbles: its angular velocity follows a
-# polhode on the inertia ellipsoid instead of remaining on a principal axis. `periods` returns the
-# two periods of the motion.
+# If it starts with a rotation about the designer's z at 6 rpm, the spacecraft tumbles: its angular
+# velocity follows a polhode on the inertia ellipsoid instead of remaining on a principal axis.
+# `periods` returns the two periods of the motion.
 
 # %%
 spin = 6 * 2 * np.pi / 60
@@ -225,9 +225,9 @@ plt.show()
 # %% [markdown]
 # ## Balancing
 #
-# Everything above can be differentiated, so the spacecraft can be balanced: two battery packs of 30
-# kg are shifted on the deck and on the floor of the bus. Newton's method finds the positions that
-# make z a principal axis through the centre of the bus.
+# Everything above is differentiable, so the spacecraft can be balanced by shifting two battery
+# packs of 30 kg on the deck and on the floor of the bus. Newton's method determines the positions
+# that make z a principal axis through the centre of the bus.
 
 
 # %%

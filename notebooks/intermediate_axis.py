@@ -44,8 +44,8 @@ scene = ph.Scene(nut)
 
 # %% [markdown]
 # ## Rotation about each axis
-# The same rate of 1 rad/s about each axis, with the same perturbation of a hundredth. One call
-# simulates all three.
+# Three bodies rotate at 1 rad/s, each about another axis, with the same perturbation of one per
+# cent. One call simulates all three.
 
 # %%
 push = 0.01
@@ -78,7 +78,7 @@ plt.show()
 # %% [markdown]
 # In space, the angular velocity moves in a plane normal to the angular momentum, along the
 # **herpolhode**. For a stable axis it is confined to a narrow ring around the momentum; for the
-# intermediate axis it spirals out from the centre and returns to it with every flip.
+# intermediate axis it spirals outward from the centre and returns to it with every flip.
 
 # %%
 fig, panels = plt.subplots(1, 3, figsize=(8.6, 3.1), layout="constrained")
@@ -102,10 +102,11 @@ picture  # noqa: B018
 
 # %% [markdown]
 # ## How often?
-# Near the axis a perturbation grows like $e^{\lambda t}$ with $\lambda =
+# Near the axis a perturbation grows as $e^{\lambda t}$ with $\lambda =
 # \omega\sqrt{(I_2-I_1)(I_3-I_2)/(I_1I_3)}$, so the time between flips depends on the logarithm of
-# the perturbation: a tenth of it adds only $\ln 10/\lambda$. The exact period is a complete
-# elliptic integral, `ph.periods`, valid also for perturbations that no integrator resolves.
+# the perturbation: a perturbation ten times smaller adds only $\ln 10/\lambda$. The exact period is
+# a complete elliptic integral, which `ph.periods` evaluates also for perturbations that no
+# integrator resolves.
 
 # %%
 small, middle, great = 1.0, 2.0, 2.5
@@ -140,9 +141,9 @@ for size, seen in zip((1e-2, 1e-6, 1e-10), measured, strict=True):
 # ## Internal friction
 # Real bodies bend and contain fluids: they lose energy, but no angular momentum, and end in a
 # rotation about the axis of the *largest* moment of inertia, as Explorer 1 did in 1958.
-# `ph.FeedbackTorque` takes any torque that depends on the state; one that acts along
-# $L\times(L\times\omega)$ removes energy and keeps the magnitude of the momentum; its direction in
-# space drifts.
+# `ph.FeedbackTorque` accepts any torque that depends on the state. A torque along
+# $L\times(L\times\omega)$ removes energy and does not change the magnitude of the momentum, but its
+# direction in space drifts; `ph.EnergySink` avoids this.
 
 
 # %%

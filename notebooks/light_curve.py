@@ -47,8 +47,9 @@ rng = np.random.default_rng(4)
 
 # %% [markdown]
 # ## The asteroid
-# The hull of 60 random points around an egg: not an ellipsoid, so the model of the search has the
-# wrong shape, as for every real asteroid. Its moments follow from its volume, at constant density.
+# The asteroid is the convex hull of 60 random points near an egg-shaped surface. It is not an
+# ellipsoid, so the model of the search has the wrong shape, as for every real asteroid. Its moments
+# are those of constant density.
 
 # %%
 corners = rng.normal(size=(60, 3))
@@ -71,10 +72,11 @@ print(f"{mode}, P_phi {truth.P_phi:.4f} d, P_psi {truth.P_psi:.4f} d")
 
 # %% [markdown]
 # ## The observations
-# Two telescopes a third of a day apart share 18 nights of 90 days; a night is six hours, some
-# points are missing. The asteroid orbits at 1.8 au, the Earth at 1 au. The light of a convex body
-# is the sum over the facets that are lit and visible, by the Lommel-Seeliger law. Noise 0.02 mag;
-# the telescopes' zero points differ from night to night by 0.02 mag too.
+# Two telescopes at longitudes 120 degrees apart observe in 18 nights within 90 days; a night has
+# six hours, and some points are missing. The asteroid orbits at 1.8 au, the Earth at 1 au. The
+# brightness of a convex body is a sum over the facets that are lit and visible, by the
+# Lommel-Seeliger law. The noise is 0.02 mag, and the zero points of the nights also differ by 0.02
+# mag.
 
 # %%
 nights = np.sort(rng.choice(90, 18, replace=False)) + rng.choice([0, 1 / 3], 18)
@@ -109,12 +111,13 @@ ax.set(xlabel="days", ylabel="magnitude", title=f"{curve.t.size} points, and not
 plt.show()
 
 # %% [markdown]
-# From here on only `curve` is used: times, magnitudes, and where Sun and Earth stood.
+# From here on only `curve` is used: times, magnitudes, and the directions of Sun and Earth.
 #
 # ## Frequencies
-# The light of a tumbling body is not periodic. It is a sum of waves of the frequencies
-# i f_phi + j f_psi. The spectrum of one frequency shows such sums and their aliases of
-# one a day, and a peak is not necessarily a period of the body. Pairs of frequencies explain more:
+# The brightness of a tumbling body is not periodic. It is a Fourier series in the frequencies i
+# f_phi + j f_psi. The spectrum contains lines at such combinations and their aliases at one cycle
+# per day, so a peak is not necessarily a frequency of the body. The search fits pairs of
+# frequencies:
 
 # %%
 columns = np.vstack([curve.columns(np.inf)[0], curve.alpha])
@@ -124,12 +127,14 @@ for g, h, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained, strict=Tru
 print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for x in pairs[:2])))
 
 # %% [markdown]
-# Every pair has many interpretations: each line may be any of the strong sums, in both modes. The
-# most probable are tried.
+# Every pair has many interpretations: each line may be any of the strong combinations, in both
+# modes. The search tries the most probable interpretations.
 #
 # ## The search
-# Trial bodies with those periods, all else at random; least-squares steps from the two best
-# of each meaning, more from what fits; once more with the periods found; the mirror images.
+# For each interpretation, trial bodies have its periods and are otherwise random. Least-squares
+# steps start from the two best bodies of each interpretation and continue from those that fit. The
+# search is repeated with the periods that it has found, and the mirror images of every solution are
+# tried.
 
 # %%
 fit = lightcurve.fit_light_curve(curve, pairs=pairs, floor=0.02)
@@ -163,12 +168,12 @@ for k, solution in enumerate(fit.solutions[:4]):
           f" {solution.probability:.1g}")  # fmt: skip
 
 # %% [markdown]
-# Periods are right within their errors, moments to 7 %. The shape that was fitted last is convex,
-# no ellipsoid, so that the residuals are those of the noise. Mirror images of the pole are in the
-# list.
+# The periods are right within their errors, the moments to 7 %. The last fit uses a general convex
+# shape instead of an ellipsoid, so that the residuals are those of the noise. The list contains
+# mirror images of the pole.
 #
-# And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
-# so the nearest of four attitudes counts.
+# The next cell compares the attitudes in each night. An ellipsoid looks the same after half a turn
+# about each axis, so the nearest of four attitudes counts.
 
 # %%
 long_to_short = np.argsort(best.moments)
@@ -185,8 +190,9 @@ print(f"attitude off by {np.median(off):.1f} deg in the median, {off.max():.1f} 
 
 # %% [markdown]
 # ## One night
-# The same asteroid, six hours from one place. Many bodies explain the points to their noise, and
-# the first of them may be far from the truth; the notes say what one night cannot show.
+# The same asteroid is observed for six hours from one place. Many bodies explain the points to
+# their noise, and the first of them may be far from the truth; the notes state what one night does
+# not determine.
 
 # %%
 one = curve.group == curve.group[0]

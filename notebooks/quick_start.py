@@ -35,8 +35,8 @@ jax.config.update("jax_enable_x64", True)  # your choice: polhode follows the dt
 
 # %% [markdown]
 # ## One body
-# A wing nut spins about its intermediate axis, with a slight push. polhode chooses the method;
-# `explain` says which one and why.
+# A wing nut spins about its intermediate axis with a small perturbation. polhode chooses the
+# method; `explain` states which one and why.
 
 # %%
 inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])  # kg m^2, about body x, y, z
@@ -63,8 +63,8 @@ print("momentum drift", float(jnp.max(jnp.ptp(traj.momentum_space, axis=0)) / 2.
 
 # %% [markdown]
 # ## A batch
-# Any array of a scene or state may have leading axes, which are broadcast. A thousand bodies that
-# differ in their push:
+# Any array of a scene or state may have leading axes, which are broadcast. These are a thousand
+# bodies with different perturbations:
 
 # %%
 rng = np.random.default_rng(0)
@@ -79,8 +79,8 @@ fig.tight_layout()
 
 # %% [markdown]
 # ## A gradient
-# How does the final attitude depend on the moments of inertia? Reverse mode through the closed
-# form:
+# How does the final attitude depend on the moments of inertia? Reverse mode differentiates the
+# closed form:
 
 
 # %%
@@ -107,8 +107,8 @@ print("central difference  ", difference, "(second entry)")
 
 # %% [markdown]
 # ## Gravity
-# The same call with a potential: a heavy top about a fixed point. The torque is a derivative of
-# the Hamiltonian.
+# The same call simulates a heavy top about a fixed point if the scene has a potential. The torque
+# is a derivative of the Hamiltonian.
 
 # %%
 top = ph.Scene(

@@ -54,9 +54,9 @@ plt.rcParams.update(
 # %% [markdown]
 # ## 1. A Foucault pendulum
 #
-# Local axes on the ground: x south, y east, z up, origin at the suspension. The Earth's rate has
-# a part along the horizon and a part along the vertical. What a plumb line shows as gravity
-# already holds the centrifugal force at the origin, so the frame needs no accelerating origin.
+# The local axes are x south, y east and z up, with the origin at the suspension. The Earth's
+# angular velocity has a horizontal and a vertical component. Gravity along a plumb line already
+# includes the centrifugal force at the origin, so the frame needs no accelerated origin.
 
 # %%
 GRAVITY = 9.81  # m/s^2
@@ -88,9 +88,10 @@ def swing(latitude, rate, length, start, ts):
 
 
 # %% [markdown]
-# The pendulum of the Panthéon: 67 m of wire, let go 3 m from the middle, at eight latitudes for
-# one hour. The plane of the swing is read off the first and the last swing. For the picture on
-# the left the same pendulum hangs in Paris on a planet whose day lasts only 40 swings.
+# The pendulum of the Panthéon has a wire of 67 m. It is released 3 m from the lowest point, at
+# eight latitudes, and swings for one hour. The plane is determined from the first and the last
+# swing. In the left figure the same pendulum hangs in Paris on a planet whose day lasts only 40
+# swings.
 
 # %%
 length, start = jnp.array(67.0), jnp.array(3.0)
@@ -143,16 +144,16 @@ print("measured / sin(latitude) law:", np.array2string(np.asarray(ratio), precis
 print("1 - 3/8 (start / length)^2  :", round(1 - 3 / 8 * float(start / length) ** 2, 4))
 
 # %% [markdown]
-# The plane rotates clockwise in the north, a little more slowly than the law of the sine predicts.
+# The plane rotates clockwise in the north, slightly more slowly than the sine law predicts.
 # A bob released at rest on the rotating Earth moves on a thin ellipse, and an
 # ellipse of finite size precesses by itself, here against the rotation of Foucault's plane, at 3/8
 # (amplitude / length)^2 of the frequency of its swing (Airy 1851).
 # ## 2. A body dropped into a shaft
 #
 # In 1831 Reich dropped balls down a mine shaft at Freiberg, 158.5 m deep, and found them 28 mm to
-# the east of the plumb line. The velocity downwards makes a Coriolis force to the east; the
-# velocity to the east makes a second, far smaller one to the south. Expanded in powers of the
-# rate, the two are $\tfrac13 g\omega\cos\lambda\,t^3$ and $\tfrac18
+# the east of the plumb line. The downward velocity causes a Coriolis force to the east; the
+# eastward velocity causes a second, much smaller one to the south. Expanded in powers of the
+# rate, the deflections are $\tfrac13 g\omega\cos\lambda\,t^3$ and $\tfrac18
 # g\omega^2\sin\lambda\cos\lambda\,t^4$.
 
 # %%
@@ -193,13 +194,13 @@ print(
 )
 
 # %% [markdown]
-# The gravity here is uniform. On the real Earth it changes along the shaft, by as much as the
-# second-order term: only the eastward deflection is a prediction.
+# Gravity is uniform in this model. On the real Earth its change along the shaft has an effect as
+# large as the second-order term, so only the eastward deflection is a prediction.
 #
 # ## 3. A bead in a tumbling box
 #
 # A box tumbles freely, thrown almost about its intermediate axis. `RotatingFrame.from_trajectory`
-# makes a frame of its body axes. A bead floats inside without touching anything: from outside it
+# returns the frame of its body axes. A bead floats inside without touching anything: in space it
 # moves along a straight line.
 
 # %%
@@ -261,10 +262,10 @@ plt.show()
 # %% [markdown]
 # ### The same bead on a spring is an accelerometer
 #
-# Fix the bead at a corner of the box with a stiff, critically damped spring. It gives way until
-# the spring carries centrifugal and Euler force, so that stretch times stiffness over mass is
-# minus the reading of an accelerometer there. `ph.accelerometer` computes that reading from the
-# equations of motion.
+# Fix the bead at a corner of the box with a stiff, critically damped spring. The spring stretches
+# until its force balances the centrifugal and Euler forces, so that stretch times stiffness over
+# mass is minus the reading of an accelerometer at this point. `ph.accelerometer` computes that
+# reading from the equations of motion.
 
 # %%
 corner = jnp.asarray(0.45 * sides)

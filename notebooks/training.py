@@ -13,10 +13,10 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/training.ipynb)
 #
-# Satellites leave the launcher with random attitudes and rates. A controller must stop them and
-# turn them to a fixed attitude within ten seconds. Two are trained by gradient descent through the
-# simulation: a linear law and a small network. Then a slew by two pulses is optimised, and the
-# shape of a body is designed such that it wobbles with a given period.
+# Satellites leave the launcher with random attitudes and rates. A controller must stop their
+# rotation and bring them to a fixed attitude within ten seconds. This notebook trains two
+# controllers by gradient descent through the simulation: a linear law and a small network. It then
+# optimises a slew by two pulses, and designs a body that nutates with a prescribed period.
 
 # %%
 # Needs polhode with its figures and optax, installed from a checkout or from an archive of a
@@ -52,8 +52,8 @@ rates = 0.3 * jax.random.normal(jax.random.key(2), (count, 3))
 # %% [markdown]
 # ## Two controllers
 #
-# Both are Equinox modules: their arrays are the parameters. The torque of each axis is limited, by
-# `clip` here and by `tanh` there.
+# Both controllers are Equinox modules, whose arrays are the parameters. The torque about each axis
+# is limited, by `clip` in the linear law and by `tanh` in the network.
 
 
 # %%
@@ -80,8 +80,9 @@ network = Network(layers)
 # %% [markdown]
 # ## The loop
 #
-# The gradient of a minibatch is coarse in any case, so the steps may pass the kinks of `relu` and
-# `clip` (`ph.CoarseSteps`). A body that does not finish within 400 steps is left out of the mean.
+# The gradient of a minibatch is noisy in any case, so the steps need not end at the kinks of `relu`
+# and `clip` (`ph.CoarseSteps`). A body that does not finish within 400 steps is excluded from the
+# mean.
 
 # %%
 ts = np.array([0.0, 10.0])
@@ -134,8 +135,8 @@ linear, by_linear = train(linear, 2e-2, 3)
 network, by_network = train(network, 1e-2, 3)
 
 # %% [markdown]
-# For a bar in place of the printed lines, wrap the loop in `tqdm.trange`. Only the last layer of
-# the network is trained further when a filter says so: all other leaves are frozen.
+# For a progress bar instead of the printed lines, wrap the loop in `tqdm.trange`. The next cells
+# train only the last layer of the network further: a filter freezes all other leaves.
 
 # %%
 chosen = jax.tree.map(lambda _: False, network)
@@ -159,9 +160,9 @@ plt.show()
 # %% [markdown]
 # ## A slew by two pulses
 #
-# The satellite turns by 90 degrees, from rest to rest, about an axis that is not principal, with
-# thrusters that push
-# along two directions for a while. The unknowns are the impulses and when the second pulse begins.
+# The satellite rotates by 90 degrees, from rest to rest, about an axis that is not principal.
+# Thrusters act along two directions for a limited time. The unknowns are the impulses and the start
+# of the second pulse.
 
 # %%
 still = ph.State([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -194,9 +195,9 @@ for step in range(301):
 # %% [markdown]
 # ## A shape with a given period
 #
-# A free cylinder of 10 kg and 0.1 m radius wobbles (its angular velocity goes round the axis in
-# body axes) with a period that depends on its length. Newton's method, applied to the frequency,
-# finds the length for which the rate about x passes zero upwards after 20 s.
+# A free cylinder of 10 kg and 0.1 m radius nutates (its angular velocity circulates about the axis,
+# as seen in the body) with a period that depends on its length. Newton's method, applied to the
+# frequency, determines the length for which the rate about x crosses zero upward after 20 s.
 
 
 # %%

@@ -15,7 +15,7 @@
 #
 # Toutatis, a rock of 4.6 km that passes the Earth every four years, tumbles.
 # Radar images of December 1992 gave its attitude on seventeen days. The scene `toutatis`, which is
-# part of polhode, holds a published state and the published observations, with sources.
+# part of polhode, contains a published state and the published observations, with sources.
 # Does a free rigid body explain the observations? How accurately are its two periods known?
 
 # %%
@@ -55,8 +55,8 @@ print("moments (relative):", scene.inertia.diagonal, "about", file.axis_names)
 # %% [markdown]
 # ## The motion
 # Torques are negligible within two months, so the motion has a closed form: `ph.simulate` evaluates
-# it at any set of times, here at those of the observations too. The state is that at the
-# first of the times.
+# it at any set of times, here also at those of the observations. The state applies at the first
+# time.
 
 # %%
 ts = DAY * jnp.linspace(0.0, 45.0, 901)
@@ -79,12 +79,12 @@ print("angle between observed and computed attitude (deg):", np.round(apart, 1))
 print(f"median {np.median(apart):.1f}, largest {apart.max():.1f}")
 
 # %% [markdown]
-# The attitudes were read off radar images, and the state was fitted to the visits of 1992 to 2008
-# together, with the tides that a free body leaves out, not to these days alone.
+# The attitudes were determined from radar images. The state was fitted to the apparitions of 1992
+# to 2008 together, with tidal torques, which the free body omits, and not to these days alone.
 #
 # ## Two periods
-# A tumbler has two: the long axis goes around the angular momentum (`P_phi`), and the body turns
-# about its long axis (`P_psi`).
+# A tumbling body has two periods: the long axis precesses about the angular momentum (`P_phi`), and
+# the body rotates about its long axis (`P_psi`).
 
 # %%
 periods = ph.periods(scene.inertia, state)
@@ -117,7 +117,7 @@ for name, part in zip(names, parts, strict=True):
 print(f"together               {np.sqrt(np.sum(parts**2)):.4f} d (to first order)")
 
 # %% [markdown]
-# Without linearisation: 20,000 clones drawn from the same errors, in one call:
+# To avoid linearisation, simulate 20,000 clones drawn from the same errors in one call:
 
 # %%
 rng = np.random.default_rng(4179)
@@ -166,11 +166,11 @@ print(f"the long axis stays between {low:.1f}° and {high:.1f}° from the angula
 
 # %% [markdown]
 # ## The inverse problem: Halley's nucleus
-# From light curves and images of 1986, Belton et al. (1991) gave Halley's nucleus a long axis 66°
-# from the angular momentum, circling it in 3.69 d, and a turn about that axis in 7.1 d. For an
-# axisymmetric body the three numbers fix the shape, since with $\theta$ the angle and $n$ the rate
-# of the long axis about the momentum $L=I_s\,n$, the turn about the long axis is
-# $\dot\psi=(I_s/I_l-1)\,n\cos\theta$.
+# From light curves and images of 1986, Belton et al. (1991) inferred that the long axis of Halley's
+# nucleus is 66° from the angular momentum and precesses about it in 3.69 d, and that the nucleus
+# rotates about that axis in 7.1 d. For an axisymmetric body these three numbers determine the ratio
+# of the moments: with the angle $\theta$ and the rate $n$ of the precession about the momentum
+# $L=I_s\,n$, the rotation rate about the long axis is $\dot\psi=(I_s/I_l-1)\,n\cos\theta$.
 
 # %%
 theta, P_phi, P_psi = np.deg2rad(66.0), 3.69 * DAY, 7.1 * DAY

@@ -14,9 +14,9 @@
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/work_and_precision.ipynb)
 #
 # A run time is meaningful only together with an error, and a constant energy does not prove that an
-# attitude is accurate. This notebook shows run times together with errors, and measures errors
-# against reference solutions that share no code with the programs compared: Taylor series in
-# 40-digit arithmetic (`python -m benchmarks.truth` in the repository).
+# attitude is accurate. This notebook shows run times together with errors. The errors are
+# differences from reference solutions that share no code with the compared programs: Taylor series
+# in 40-digit arithmetic (`python -m benchmarks.truth` in the repository).
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -91,7 +91,7 @@ HEAVY_TOP = np.loadtxt(
 # %% [markdown]
 # Three programs solve the same equations, each at five tolerances: polhode, diffrax with the
 # quaternion and the rates as its state, and SciPy with all bodies as one system. Compilation is not
-# timed. Times are those of the machine that ran this notebook: compare ratios.
+# timed. Times depend on the machine that ran this notebook: compare their ratios.
 
 # %%
 count, moments, ts = len(HEAVY_TOP), [1.0, 1.5, 2.0], jnp.array([0.0, 100.0])
@@ -178,8 +178,9 @@ plt.show()
 
 # %% [markdown]
 # ## Conservation and accuracy
-# With a loose tolerance the energy is far more accurate than the attitude: it shows only the error
-# normal to its level set, not the one along it. The worst bodies of this top are chaotic.
+# With a loose tolerance the energy is far more accurate than the attitude: it reveals only the
+# error normal to its level set, not the error along it. The bodies with the largest errors are
+# chaotic.
 
 # %%
 print("rtol     energy drift   attitude error: median   worst body")
@@ -192,10 +193,10 @@ for rtol in (1e-4, 1e-6, 1e-8):
 
 # %% [markdown]
 # ## Closed forms
-# The free motion has a closed form. Its error is the rounding error of the angle, whatever the
-# time span; the two reference tables are for moments (1, 2, 3) kg m²: after 10⁵ s, and after 100 s
-# near the separatrix, where textbook formulas lose half of their digits because the modulus is
-# within rounding of one. polhode computes with the complement of the modulus instead.
+# The free motion has a closed form, whose error is the rounding error of the angle for any time
+# span. The two reference tables are for moments (1, 2, 3) kg m²: after 10⁵ s, and after 100 s near
+# the separatrix, where textbook formulas lose half of their digits because the modulus is within
+# rounding error of one. polhode computes with the complement of the modulus instead.
 
 # %%
 LONG = np.loadtxt(
@@ -237,5 +238,5 @@ for horizon in (100.0, 1e5):
     print(f"1,000 free bodies to t = {horizon:.0f} s: {1e6 * spent:.2f} us per body")
 
 # %% [markdown]
-# More programs, problems and precisions, and where others are better:
-# [benchmarks](../benchmarks/README.md).
+# The [benchmarks](../benchmarks/README.md) contain more programs, problems and precisions, and the
+# cases in which other programs are better.

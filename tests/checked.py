@@ -1,4 +1,4 @@
-"""Run-time checks of the package's annotations, switched on by conftest.py for tests alone."""
+"""Run-time type checks of the package's annotations; conftest.py enables them in tests only."""
 
 from collections.abc import Callable, Sequence
 from types import UnionType
@@ -11,16 +11,16 @@ from beartype import BeartypeConf, beartype
 CHECKED: set[str] = set()
 """Functions whose annotations are checked: ``module.qualified_name``."""
 
-# An int is a float here, as for every other tool that reads annotations (PEP 484).
+# An int is accepted for a float, as in PEP 484.
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
 def checked(function: Callable) -> Callable:
-    """``function`` with its annotations checked.
+    """``function`` with run-time checks of its annotations.
 
-    Left out: ``Self``, which has a meaning in classes only, and what a user writes (unions with
-    NumPy arrays): lists and numbers of all kinds, which the package itself converts or refuses.
-    An array of any kind is one of NumPy too, where trajectories are looked at.
+    Two kinds of annotations are not checked: ``Self``, which has a meaning in classes only, and
+    unions with NumPy arrays for user input, since the package itself converts or rejects lists and
+    numbers. A hint for an array without a shape also accepts NumPy arrays.
     """
     CHECKED.add(f"{function.__module__}.{function.__qualname__}")
     hints = getattr(function, "__annotations__", {})
@@ -30,7 +30,7 @@ def checked(function: Callable) -> Callable:
 
 
 def _of_any_kind(hint):
-    """The hint with anything in place of an array without a shape."""
+    """The hint, with ``Any`` in place of arrays without a shape."""
     if hint is jax.Array:
         return Any
     if getattr(hint, "array_type", None) is jax.Array:

@@ -1,5 +1,6 @@
-"""Settings shared by every test: one folder of compiled programs, float64 available, strict
-promotion, annotations checked, the folder of truth files."""
+"""Settings shared by all tests: one cache of compiled programs, float64 available, strict dtype
+promotion, checked annotations, the folder of reference data.
+"""
 
 import contextlib
 import ctypes
@@ -10,12 +11,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# What one process of a run has compiled, the others read: workers, subprocesses, notebook kernels.
+# Workers, subprocesses and notebook kernels of a run share their compiled programs.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# XLA names its own tuning flags as features that the machine lacks when it reads such a program.
+# Reading such a program, XLA warns that the machine lacks features that are its own tuning flags.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-if "PYTEST_XDIST_WORKER" in os.environ:  # one core a worker: XLA reads this when it wakes up
+if "PYTEST_XDIST_WORKER" in os.environ:  # one core per worker; XLA reads this when it starts
     os.environ.setdefault("NPROC", "1")
 
 import jax
@@ -26,7 +27,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Rooms whose annotations are checked at every call (see checked.py); imported after this line.
+# Modules whose annotations are checked at every call (see checked.py); imported after this line.
 CHECKED = (
     "rotation",
     "inertia",
@@ -38,17 +39,17 @@ assert not [name for name in sys.modules if name.split(".")[0] == "polhode"]
 jaxtyping.install_import_hook([f"polhode.{room}" for room in CHECKED], "checked.checked")
 
 
-# Tracing makes millions of objects that live: they are looked over for cycles less often.
+# Tracing creates millions of permanent objects: the garbage collector scans them less often.
 gc.set_threshold(200_000, 50, 100)
 
 
 _MOST = 4 * 2**30
-"""Bytes that a worker may hold before it drops its programs: the next test reads from the disk
-those that it needs again. Two workers that keep the programs of a whole run take 24 GB."""
+"""Memory [bytes] at which a worker drops its programs; later tests read those that they need from
+disk. Without this limit two workers take 24 GB in a complete run."""
 
 
 def _held() -> int:
-    """Bytes of memory that this process holds; 0 where the system does not tell."""
+    """Resident memory of this process in bytes; 0 if the system does not provide it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -58,12 +59,12 @@ def _held() -> int:
 
 @pytest.fixture(autouse=True, scope="module")
 def few_programs():
-    """Programs do not pile up over a run."""
+    """Clear JAX's caches when memory grows, so that compiled programs do not accumulate."""
     yield
     if _held() > _MOST:
         jax.clear_caches()
         gc.collect()
-        with contextlib.suppress(OSError, AttributeError):  # glibc keeps what is freed
+        with contextlib.suppress(OSError, AttributeError):  # glibc retains freed memory
             ctypes.CDLL(None).malloc_trim(0)
 
 
@@ -79,7 +80,7 @@ def _unchecked():
 
 @pytest.fixture
 def unchecked():
-    """Annotations are not looked at: for tests of what the package itself does with wrong input."""
+    """Disable the annotation checks, for tests of how the package itself handles wrong input."""
     with _unchecked():
         yield
 
@@ -89,7 +90,7 @@ _raises = pytest.raises
 
 @contextlib.contextmanager
 def _raises_in_its_own_words(expected, **options):
-    """``pytest.raises``: what is to fail must fail by the package's own checks and words."""
+    """``pytest.raises`` for errors that the package raises, not the annotation checks."""
     aside = contextlib.nullcontext() if expected is jaxtyping.TypeCheckError else _unchecked()
     with _raises(expected, **options) as found, aside:
         yield found
@@ -106,7 +107,7 @@ def _shared_folder() -> Path | None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of recordings and truth states; the test is skipped where it is absent."""
+    """The folder of recordings and reference states; the test is skipped if it is absent."""
     folder = _shared_folder()
     if folder is None:
         pytest.skip("the folder ../shared (recordings, truth states) is not beside this checkout")

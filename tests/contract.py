@@ -12,7 +12,7 @@ STUB = Path(ph.__file__).with_suffix(".pyi")
 
 
 def stub_names(path: Path = STUB) -> list[str]:
-    """Names that the stub re-exports, in its order."""
+    """Names that the stub re-exports, in their order there."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     imports = (node for node in tree.body if isinstance(node, ast.ImportFrom))
     return [name.asname or name.name for node in imports for name in node.names]

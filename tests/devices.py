@@ -1,4 +1,4 @@
-"""What a script tells that is run with two host devices, which one process cannot change."""
+"""Run scripts that use two host devices; the number cannot be changed within a process."""
 
 import json
 import subprocess
@@ -7,7 +7,10 @@ from pathlib import Path
 
 
 def told_by(script: Path, *words: str) -> dict:
-    """The JSON of its last line, given some words, without the count of devices."""
+    """The JSON of a script's last line of output, without its number of devices, which must be two.
+
+    ``words``: arguments of the script.
+    """
     done = subprocess.run(
         [sys.executable, str(script), *words], capture_output=True, timeout=900, text=True
     )

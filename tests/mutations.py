@@ -1,9 +1,9 @@
-"""Mutation testing of the formulas: ``python tests/mutations.py [--only WORD ...] [--jobs N]``.
+"""Mutation tests of the formulas: ``python tests/mutations.py [--only WORD ...] [--jobs N]``.
 
 Each mutant is a copy of the package in which one formula is changed (a sign, a factor, an index).
-It is run against the tests named beside it, of which one must fail; if all pass, against ``WIDER``.
-Prints a table; exits with 1 if a mutant survives, and with 2 if one cannot be run. ``--unmutated``
-runs the same tests on an unchanged copy, where all must pass.
+At least one of the tests named with it must fail; if all pass, the tests of ``WIDER`` run. The
+result is a table; the exit code is 1 if a mutant survives, and 2 if one cannot be run.
+``--unmutated`` runs the same tests on an unchanged copy, where all must pass.
 """
 
 import argparse
@@ -25,7 +25,7 @@ WIDER += ("frames", "test_simulate.py", "test_events.py", "test_propagate.py", "
 
 
 class Mutant(NamedTuple):
-    """One changed formula: ``old`` stands once in ``file`` (of ``src/polhode``)."""
+    """One changed formula: ``old`` occurs once in ``file`` (of ``src/polhode``)."""
 
     file: str
     old: str
@@ -536,7 +536,7 @@ MUTANTS = (
 
 
 def mutated_text(mutant: Mutant, package: Path = PACKAGE) -> str:
-    """The file with its formula changed; ValueError unless ``old`` stands in it exactly once."""
+    """The file with its formula changed; ValueError unless it contains ``old`` exactly once."""
     path = package / mutant.file
     if not path.exists():
         raise ValueError(f"{mutant.file} does not exist: name the file that holds {mutant.old!r}")
@@ -557,7 +557,7 @@ class Outcome(NamedTuple):
 def run_tests(source: Path, tests: Sequence[str]) -> tuple[int, str]:
     """Exit status of pytest with the package in ``source``, and the first failed test.
 
-    Of files the slow tests are left out; a test that is named runs in any case.
+    Of a file only the tests that are not slow run; a test given by name runs in any case.
     """
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:xdist"]
     command += [] if all("::" in test for test in tests) else ["-m", "not slow"]
@@ -570,13 +570,13 @@ def run_tests(source: Path, tests: Sequence[str]) -> tuple[int, str]:
 
 
 def copied(folder: Path) -> Path:
-    """A copy of the package in an empty folder."""
+    """Copy the package to an empty folder; returns its path."""
     shutil.copytree(PACKAGE, folder / "polhode", ignore=shutil.ignore_patterns("__pycache__"))
     return folder
 
 
 def outcome_of(mutant: Mutant) -> Outcome:
-    """Whether the tests of a mutant, or those of ``WIDER``, fail."""
+    """Run the tests of a mutant and, if they pass, those of ``WIDER``."""
     begin = time.monotonic()
     try:
         text = mutated_text(mutant)

@@ -1,10 +1,10 @@
-"""Execute the examples of the documentation and store what they print: ``make examples``.
+"""Execute the examples of the documentation and store their output: ``make examples``.
 
     python tests/page_outputs.py [PAGE ...]
 
 A page is README.md or a Markdown file under docs/. The ``python`` blocks of a page run one after
-another in a process of their own. What a block prints stands in the ``output`` block below it;
-figures that it saves, and that the page shows, are copied into docs/figures.
+another in one process. The ``output`` block after a block contains what it prints. Figures that a
+block saves and the page shows are copied to docs/figures.
 """
 
 import json
@@ -61,7 +61,7 @@ def figures(text: str) -> list[str]:
 
 
 def executed(text: str, folder: Path) -> list[str]:
-    """What every example of a page prints, executed in ``folder``."""
+    """Run all examples of a page in ``folder``; what each of them prints."""
     (folder / "blocks.json").write_text(json.dumps([code for code, _ in blocks(text)]), "utf-8")
     (folder / "runner.py").write_text(RUNNER, "utf-8")
     paths = os.pathsep.join([str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
@@ -78,7 +78,7 @@ def executed(text: str, folder: Path) -> list[str]:
 
 
 def with_outputs(text: str, outputs: list[str]) -> str:
-    """The page with these outputs below its examples."""
+    """The text of the page with these outputs after its examples."""
     rest = iter(outputs)
 
     def example(match: re.Match) -> str:

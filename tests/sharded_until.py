@@ -1,4 +1,4 @@
-"""Run by the tests with 2 host devices: bodies that stop, sharded and on one device, as JSON."""
+"""Script for tests with 2 host devices: bodies that stop, sharded and on one device, as JSON."""
 
 import json
 

@@ -1,7 +1,7 @@
-"""What any supported set of versions must do: ``python tests/smoke.py [name ...]``.
+"""Tests for any supported set of versions: ``python tests/smoke.py [name ...]``.
 
-The README's ten lines, one scene of each kind with value and gradient, in both modes, a fit, and
-the commands with their files; names select some of these. versions.py runs it.
+They cover the README's examples, one scene of each kind with value and gradient in both modes, a
+fit, and the commands with their files; names select some of these. versions.py runs this script.
 """
 
 import contextlib
@@ -13,7 +13,7 @@ import warnings
 from importlib.metadata import version
 from pathlib import Path
 
-# as the command line does, see polhode.cli
+# as polhode.cli does
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
@@ -63,7 +63,7 @@ SCENES = {
 
 
 def check_scene(scene, moments):
-    """The planner's value against another integrator, its gradient against differences."""
+    """The default method against another integrator, its gradient against differences."""
     state = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
 
     def end(m, method=None):
@@ -72,7 +72,7 @@ def check_scene(scene, moments):
 
     value, slope = jax.jit(jax.value_and_grad(end))(moments)
     np.testing.assert_allclose(value, end(moments, ph.LiePoisson()), rtol=0, atol=1e-8)
-    # two steps that keep a symmetric body symmetric
+    # two changes that preserve the symmetry of the body
     for step in (jnp.array([1.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0])):
         ends = [end(moments + s * 1e-5 * step) for s in (1, -1)]
         along = (ends[0] - ends[1]) / 2e-5
@@ -82,7 +82,7 @@ def check_scene(scene, moments):
 
 
 def check_fit():
-    """The shape of a free body out of its rates, to the noise."""
+    """The inertia ratios of a free body from its rates, to the noise."""
     times = np.linspace(0, 6, 150)
     moments = np.array([1.0, 1.6, 2.1])
     scene = ph.Scene(ph.Inertia.from_moments(moments))

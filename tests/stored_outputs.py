@@ -1,10 +1,11 @@
-"""Execute the notebooks from their text forms and keep the outputs: ``make notebooks``.
+"""Execute the notebooks from their text forms and store the outputs: ``make notebooks``.
 
     python tests/stored_outputs.py [NAME ...]
 
-writes notebooks/NAME.ipynb, all of them without names. The metadata of each notebook hold a stamp:
-the version of polhode and hashes of the cells and of the signatures of the public names that the
-notebook uses. A test compares the stamp; a slow one executes the notebooks again and compares text.
+writes notebooks/NAME.ipynb, by default for all notebooks. The metadata of each notebook contain a
+stamp: the version of polhode, and hashes of the cells and of the signatures of the public names
+that the notebook uses. A fast test compares the stamp; a slow test executes the notebooks again and
+compares their outputs.
 """
 
 import hashlib
@@ -36,7 +37,7 @@ ROUNDING = 1e-10
 
 
 def executed(name: str) -> nbformat.NotebookNode:
-    """The notebook of a text form, executed in a kernel that imports this polhode, and stamped."""
+    """The notebook of a text form, executed by a kernel that imports this polhode, with a stamp."""
     book = jupytext.read(FOLDER / f"{name}.py")
     probe = nbformat.v4.new_code_cell("import polhode\nprint(polhode.__file__)")
     book.cells.append(probe)
@@ -62,7 +63,7 @@ def executed(name: str) -> nbformat.NotebookNode:
 
 
 def merged(outputs: list) -> list:
-    """Outputs with pieces of one stream joined: how it was cut depends on timing."""
+    """Outputs with the pieces of a stream joined, since their number depends on timing."""
     streams, others = {}, []
     for output in outputs:
         if output.output_type != "stream":
@@ -88,7 +89,7 @@ def stamp(name: str) -> dict[str, str]:
 
 
 def interface(words: set[str]) -> dict[str, str]:
-    """Parameters of the public functions and classes, and of their methods, named by ``words``."""
+    """Parameters of the public functions, classes and methods whose names are in ``words``."""
     found = {}
     for full in public_names.public_names():
         module, _, last = full.rpartition(".")
@@ -104,7 +105,7 @@ def interface(words: set[str]) -> dict[str, str]:
 
 
 def parameters(thing: object) -> str:
-    """Names and kinds of the parameters; without defaults, whose text may depend on versions."""
+    """Names and kinds of the parameters, without defaults, whose text may depend on versions."""
     try:
         signature = inspect.signature(thing)
     except (TypeError, ValueError):
@@ -120,7 +121,7 @@ def digest(value: object) -> str:
 
 
 def texts(book: nbformat.NotebookNode) -> list[tuple[int, str, bool]]:
-    """(number of the cell, text, whether it holds timings) of every output that is text."""
+    """(number of the cell, text, whether it contains timings) of every output that is text."""
     found = []
     for number, cell in enumerate(book.cells):
         timed = "timing" in cell.metadata.get("tags", [])
@@ -133,11 +134,12 @@ def texts(book: nbformat.NotebookNode) -> list[tuple[int, str, bool]]:
 
 
 def difference(stored: str, new: str, *, timed: bool = False) -> str | None:
-    """Where two texts differ in more than the last digits of their numbers; None: nowhere.
+    """Where two texts differ by more than the last digits of their numbers; None if nowhere.
 
-    Numbers agree to 1e-6 of their size or one unit of the last digit printed. Those of one or two
-    digits with an exponent, such as 3e-09, are sizes of errors: they agree within a factor of 10.
-    Numbers below 1e-10 agree with each other. ``timed``: numbers are timings, not compared.
+    Numbers agree to a relative error of 1e-6 or to one unit of the last printed digit. Numbers of
+    one or two digits with an exponent, such as 3e-09, are sizes of errors: they agree within a
+    factor of 10. Numbers below 1e-10 agree with each other. ``timed``: numbers are timings and not
+    compared.
     """
     words = [NUMBER.sub("#", text).split() for text in (stored, new)]
     words = [[w.strip("[]") for w in row if w.strip("[]")] for row in words]  # padding of arrays
@@ -167,7 +169,7 @@ def digits(number: str) -> int:
 
 
 def unit(number: str) -> float:
-    """One unit in the last place printed; none of a whole number."""
+    """One unit in the last printed place; zero for an integer."""
     mantissa, _, exponent = number.lower().partition("e")
     places = len(mantissa.partition(".")[2])
     return 10.0 ** (int(exponent or 0) - places) if "." in mantissa or exponent else 0.0

@@ -1,4 +1,4 @@
-"""Every benchmark runs at a tiny size, scores right, and pages hold what the results say."""
+"""Every benchmark runs at a tiny size and scores correctly; pages agree with the stored results."""
 
 import ast
 import dataclasses
@@ -33,7 +33,9 @@ KNOWN = PROBLEMS | {SATELLITE.name: SATELLITE}
 
 
 def test_only_a_benchmark_that_is_run_takes_one_core():
-    """One that a test imports would keep the rest of the tests, on all workers, on one core."""
+    """If an import restricted the process to one core, all further tests, on all workers, would run
+    on that core.
+    """
     for path in Path(_report.__file__).parent.glob("*.py"):
         for line in ast.parse(path.read_text()).body:
             if isinstance(line, ast.Expr) and isinstance(line.value, ast.Call):
@@ -65,7 +67,7 @@ def test_truth_is_what_another_taylor_series_gives(name):
         other = taylor.integrate(field, [*map(mpf, omega), *(x / size for x in q)], 0, 1, 4)
         found = truth.motion(problem, wxyz, omega, [1.0])[0]
         apart = max(abs(a - b) for a, b in zip(found, [*other[3:], *other[:3]]))
-    # the direction (0.6, 0, 0.8) is a unit vector to rounding only
+    # (0.6, 0, 0.8) is a unit vector only up to rounding
     assert apart < mpf(10) ** (-16 if problem.gradient else -24)
 
 
@@ -115,7 +117,7 @@ def test_errors_are_angles_and_a_failure_counts_as_one():
     assert problems.errors(exact, turned, None)["attitude_worst"] == pytest.approx(math.pi)
 
 
-# Peers move the same bodies
+# Other programs simulate the same bodies
 
 
 @pytest.mark.parametrize("name", [name for name in KNOWN if name != "long"])
@@ -337,7 +339,7 @@ def test_gradients_through_controllers_are_timed_and_scored(tmp_path, monkeypatc
     numbers = _report.read(path)["numbers"]
     errors = {(row["program"], row["tolerance"]): row["error"] for row in numbers["rows"]}
     assert errors["polhode", 1e-6] < 1e-4
-    assert errors["diffrax Dopri8", 1e-6] < 1e-2  # the same motion, but past kinks
+    assert errors["diffrax Dopri8", 1e-6] < 1e-2  # the same motion, but integrated across kinks
     (check,) = numbers["checks"]
     assert max(check["along"], check["across"]) < 1e-5
     assert all(row["seconds"] > 0 and row["compile_s"] > 0 for row in numbers["rows"])
@@ -379,7 +381,7 @@ def test_reading_of_bodies_from_files_is_timed():
 
 @pytest.fixture
 def free_bodies(monkeypatch):
-    """The benchmark of free bodies with the truth of eight of them after 2 s."""
+    """The benchmark of free bodies, with the reference of eight bodies after 2 s."""
     from benchmarks import free_body
 
     assert FREE.moments == free_body.CASES["A"]
@@ -419,7 +421,7 @@ def test_a_result_comes_back_and_holds_no_number_that_json_lacks(tmp_path, monke
 
 
 def test_programs_take_turns_and_slow_ones_are_run_less_often(monkeypatch):
-    """By a clock that the programs themselves move on."""
+    """With a clock that the programs themselves advance."""
     now, calls = [0.0], []
     monkeypatch.setattr(_report.time, "perf_counter", lambda: now[0])
 
@@ -438,7 +440,7 @@ def test_programs_take_turns_and_slow_ones_are_run_less_often(monkeypatch):
     assert found["quick"].repeats == 5
     assert calls.count("slow") == 2
     last = len(calls) - 1 - calls[::-1].index("slow")
-    assert "quick" in calls[last:]  # the quick one goes on
+    assert "quick" in calls[last:]  # the fast program is still run
 
 
 def _table(times, errors=(1e-4, 1e-8, 1e-12)):
@@ -469,7 +471,7 @@ def test_time_at_a_level_is_interpolated_and_never_extrapolated():
     from benchmarks.work_precision import time_at
 
     rows = _table((100.0, 400.0, 1600.0))["rows"][1:]
-    assert time_at(rows, 1e-3) == 100  # cheaper settings were not run
+    assert time_at(rows, 1e-3) == 100  # the cheapest setting that was run
     assert time_at(rows, 1e-6) == pytest.approx(200)
     assert time_at(rows, 1e-12) == 1600
     assert time_at(rows, 1e-13) is None
@@ -498,7 +500,7 @@ def test_the_fastest_peer_is_named_with_its_time_over_that_of_the_default():
     assert line["to_1e-03_rad"] == "0.2 x other"
     (line,) = slow["fastest_peer_worst_body"]
     assert line["to_1e-12_rad"] == "only polhode"
-    assert slow["default_errors"] == []  # an exact method
+    assert slow["default_errors"] == []  # a closed form
 
 
 def _result(times, **more):
@@ -507,7 +509,7 @@ def _result(times, **more):
 
 
 def test_numbers_are_shown_by_their_keys():
-    """Entries that are alike as rows of one table, a list of a few numbers in a cell."""
+    """Entries with common keys are rows of a table; a short list of numbers fits into a cell."""
     lines = _page.by_keys("", {"speed_of": {"a": {"ns": 1.5, "m": [1, 2]}, "b": {"ns": None}}})
     assert lines == [
         "**speed of**",
@@ -560,7 +562,7 @@ def test_engines_are_scored_by_attitude_energy_and_momentum():
 
     body = engines.bodies()[0]
     half = 0.5e-6
-    turn = np.array([math.cos(half), math.sin(half), 0, 0])  # in space, by 1e-6 rad
+    turn = np.array([math.cos(half), math.sin(half), 0, 0])  # a rotation in space by 1e-6 rad
     w, x, y, z = body["wxyz"]
     turned = np.array(
         [
@@ -638,7 +640,7 @@ def test_errors_over_the_tolerance_are_shown_by_scene():
 
 
 def test_a_result_holds_its_derived_tables():
-    """As its benchmark derives them from its rows."""
+    """The stored tables equal those that the benchmark derives from the stored rows."""
     from benchmarks import controllers, engines, rotation_stress, torqued, work_precision
 
     derived = {
@@ -712,7 +714,7 @@ HASH = re.compile(r"[0-9a-f]{40}")
 
 
 def git(*words: str, folder: Path = _report.ROOT) -> str | None:
-    """What git prints; None where it fails or is not installed."""
+    """Output of a git command; None if it fails or git is not installed."""
     try:
         done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)
     except FileNotFoundError:
@@ -746,7 +748,9 @@ def test_numbers_that_were_changed_or_removed_are_found():
 
 @pytest.mark.parametrize("path", sorted(_report.RESULTS.glob("*.json")), ids=lambda p: p.stem)
 def test_the_commit_named_holds_the_same_numbers(path):
-    """As far as the clone has the history; tables that are derived from them may be added."""
+    """Checked as far as the clone contains the history. The later file may have additional derived
+    tables.
+    """
     report = _report.read(path)
     parts = dict(report["numbers"].pop("origin", {}))
     origins = {None: report, **parts}
@@ -778,7 +782,7 @@ def test_a_result_names_the_commit_and_the_machine_that_made_it(tmp_path):
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A repository with a package of the name polhode, in place of this one."""
+    """A repository with another package named polhode."""
     package = tmp_path / "src" / "polhode" / "__init__.py"
     result = tmp_path / "benchmarks" / "results" / "a.json"
     for file in (package, result):

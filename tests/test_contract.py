@@ -1,4 +1,4 @@
-"""The contract of names: one list, nothing else public, complete annotations."""
+"""The public interface: one list of names, nothing else public, complete annotations."""
 
 import importlib.util
 import inspect
@@ -30,7 +30,7 @@ def test_the_stub_lists_the_public_names_and_nothing_else_is_public():
     assert len(set(names)) == len(names)
     assert sorted(names) == sorted(dir(ph)) == sorted(ph.__all__)
     with pytest.raises(AttributeError):
-        ph.Any  # noqa: B018 - what the module imports for itself is not public
+        ph.Any  # noqa: B018 - an internal import of the module
 
 
 def test_no_public_name_is_also_a_module():
@@ -100,10 +100,10 @@ print(len(compiled) > 0)
 
 
 def test_a_scene_is_described_without_compiling():
-    """Each operation on a single array that JAX compiles takes as long as a thousand of NumPy's."""
+    """Compiling one array operation takes as long as a thousand NumPy operations."""
     result = subprocess.run([sys.executable, "-c", CONSTRUCTED], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr[-2000:]
-    # the identity, for Python numbers, and the rates of decay that explain names
+    # exceptions: identity for Python numbers, decay rates for explain
     assert result.stdout.split() == ["2", "True"]
 
 

@@ -31,8 +31,8 @@ SKETCHES = {
     "scale": 1,
     "how-to/use_tables": 2,
     "how-to/import_mass_properties": 1,
-}  # `py`: need more than polhode
-WIDTH = 100  # columns of a code box
+}  # `py` blocks, which need other packages and are not run
+WIDTH = 100  # columns of a code block
 
 
 def rows() -> list[tuple[str, list[str]]]:
@@ -187,7 +187,7 @@ def test_every_public_name_has_a_docstring():
 
 
 def directives(text: str, page: str) -> list[str]:
-    """The names that a page of the reference documents, in full."""
+    """The full names that a page of the reference documents."""
     module = page
     found = []
     for directive, name in re.findall(r"^\.\. (py:\w+|auto\w+):: (\S+)$", text, re.M):
@@ -294,7 +294,7 @@ def test_formulas_become_mathml():
 
 
 def test_the_source_cites_what_a_reader_can_open():
-    """Pages of the documentation that are there; no notes that only their authors have."""
+    """Cited pages exist, and no notes are cited that are not part of the repository."""
     for path in sorted((ROOT / "src" / "polhode").rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"\b(theory|errata|display)s? (section |sections )?\d", text), path
@@ -304,7 +304,7 @@ def test_the_source_cites_what_a_reader_can_open():
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """The built site; a warning, such as a broken link, fails the build."""
+    """The built site; a warning, such as one of a broken link, fails the build."""
     for module in ("sphinx", "furo", "myst_nb", "latex2mathml"):
         pytest.importorskip(module, reason="the group docs is not installed")
     folder = tmp_path_factory.mktemp("site")

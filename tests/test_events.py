@@ -1,4 +1,4 @@
-"""Events: times known in closed form, pairs between looks, derivatives, and motions that stop."""
+"""Events: times in closed form, pairs between samples, derivatives, and motions that stop."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ PENDULUM = ph.Scene(ph.Inertia.from_moments([0.8, 0.9, 0.5]), ph.UniformGravity(
 
 
 class Height(eqx.Module):
-    """Of body x over a level; the level is a leaf, so that no new one compiles anything."""
+    """Height of body x over a level; the level is a leaf, so that its value does not recompile."""
 
     level: jax.Array
 
@@ -42,7 +42,7 @@ def known(level, rate=RATE, last=10.0):
 
 
 def test_crossings_of_a_turning_ball():
-    """To 1e-12 of the time for a closed form; of steps: the pendulum below."""
+    """To a relative error of 1e-12 in closed form; integrated motions: the pendulum below."""
     traj = ph.simulate(BALL, STATE, TS)
     for level in (0.0, 0.4, -0.9):
         found = ph.crossings(traj, height(level))
@@ -52,7 +52,7 @@ def test_crossings_of_a_turning_ball():
         np.testing.assert_allclose(found.times, want, rtol=1e-12)
         np.testing.assert_allclose(found.slope, -RATE * np.cos(RATE * want), rtol=1e-8)
     assert ph.crossings(traj, height(1.1)).times.shape == (0,)
-    # a pair far closer than the looks, and a maximum that stays just below
+    # a pair much closer than the samples, and a maximum just below the level
     top = 1.5 * np.pi / RATE + 2 * np.pi / RATE * np.arange(2)
     pair = ph.crossings(traj, height(1 - 1e-8))
     apart = np.arccos(1 - 1e-8) / RATE
@@ -70,10 +70,10 @@ def test_directions_and_time_that_runs_backwards():
         wanted = np.sign(every.slope) == direction
         np.testing.assert_allclose(found.times, np.asarray(every.times)[wanted], rtol=1e-14)
         assert np.all(np.sign(found.slope) == direction)
-        assert np.all(np.diff(found.times) < 0)  # as the motion meets them
+        assert np.all(np.diff(found.times) < 0)  # in the order of the motion
 
 
-@pytest.mark.slow  # of a simulation: below
+@pytest.mark.slow  # faster: events of a simulation, below
 def test_each_body_of_a_batch_has_times_of_its_own():
     rates = np.array([0.05, 0.6, 1.3])
     state = ph.State(STATE.wxyz, jnp.stack([jnp.zeros(3), jnp.asarray(rates), jnp.zeros(3)], -1))
@@ -84,20 +84,20 @@ def test_each_body_of_a_batch_has_times_of_its_own():
         assert found.count[k] == want.size
         np.testing.assert_allclose(found.times[k, : want.size], want, rtol=1e-12)
         assert np.all(np.isinf(found.times[k, want.size :]))
-    one = ph.crossings(traj, height(0.4), capacity=1)  # no room for all: told
+    one = ph.crossings(traj, height(0.4), capacity=1)  # too small a capacity is reported
     np.testing.assert_array_equal(one.complete, found.count <= 1)
     np.testing.assert_allclose(one.times[2, 0], known(0.4, 1.3)[0], rtol=1e-12)
 
 
 def test_event_times_have_derivatives():
-    """t = x / rate for a fixed phase x: dt/drate = -t/rate; and in the level, 1/slope."""
+    """t = x / rate at a fixed phase x: dt/drate = -t/rate; with respect to the level, 1/slope."""
 
     @jax.jit
     @jax.value_and_grad
     def second(given):
         rate, level = given
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
-        traj = ph.simulate(BALL, state, TS)  # in steps: below
+        traj = ph.simulate(BALL, state, TS)  # integrated motions: below
         return ph.crossings(traj, Height(level), capacity=3, samples=64).times[1]
 
     time, (in_rate, in_level) = second((jnp.asarray(RATE), jnp.asarray(0.4)))
@@ -107,7 +107,7 @@ def test_event_times_have_derivatives():
 
 
 def test_a_pendulum_passes_below_after_a_quarter_period():
-    """From rest at 1 rad: 4 K(sin^2(1/2)) / sqrt(m g l / I) by SciPy; its rate is gravity's."""
+    """From rest at 1 rad: 4 K(sin^2(1/2)) / sqrt(m g l / I) by SciPy, for the same gravity."""
     state = ph.State([np.cos(0.5), np.sin(0.5), 0.0, 0.0], [0.0, 0.0, 0.0])
     traj = ph.simulate(PENDULUM, state, [0.0, 6.0], rtol=1e-11)
     found = ph.crossings(traj, lambda wxyz, omega_body, t: wxyz[1] * wxyz[0])
@@ -117,7 +117,7 @@ def test_a_pendulum_passes_below_after_a_quarter_period():
 
 
 class Rate(eqx.Module):
-    """About body y over a level, a leaf."""
+    """Rate about body y minus a level; the level is a leaf."""
 
     level: jax.Array
 
@@ -126,10 +126,10 @@ class Rate(eqx.Module):
 
 
 def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
-    """Thrusters bring the body to a rate, w = a t, and push it on harder to another one."""
+    """A thruster accelerates the body to one rate, w = a t, a stronger one to a second rate."""
     inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 
-    def pushed(torque, state, ts, rate):  # the same program in every call
+    def pushed(torque, state, ts, rate):  # one program for both calls
         scene = ph.Scene(inertia, None, ph.BodyTorque(torque * jnp.array([0.0, 1.0, 0.0])))
         return ph.simulate(scene, state, ts, until=ph.Event(Rate(jnp.asarray(rate)), 1))
 
@@ -147,14 +147,14 @@ def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
         [0.25 * 4**2 / 2 + 2 + 0.5 * 2**2 / 2, 0.75 + 0.25 / 2 + 0.75 + 0.5 * 0.75**2 / 2]
     )
     np.testing.assert_allclose(np.abs(off.last.wxyz[:, 0]), np.abs(np.cos(turned / 2)), atol=1e-11)
-    # at the surface of the event itself the motion starts: that is no crossing
+    # the motion starts where the event function is zero: that is not a crossing
     again = pushed(0.5, on.last, ts, 1.0)
     assert np.all(np.isinf(again.event_time))
 
 
-@pytest.mark.slow  # one scene after another, of motions in steps: above
+@pytest.mark.slow  # faster: one scene after another, integrated, above
 def test_a_motion_in_steps_goes_on_in_closed_form():
-    """A thruster brings the body to a rate, w = a t; then it turns freely to an attitude."""
+    """A thruster accelerates the body to a rate, w = a t; then it rotates freely to an attitude."""
     inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])
     burning = ph.Scene(inertia, None, ph.BodyTorque([0.0, 0.5, 0.0]))  # 0.25 rad/s^2 about y
     rest = ph.State([1.0, 0, 0, 0], jnp.zeros((2, 3)).at[1, 1].set(0.75))
@@ -163,7 +163,8 @@ def test_a_motion_in_steps_goes_on_in_closed_form():
     on = ph.simulate(burning, rest, ts, until=reached)
     ts = np.asarray(on.event_time)[:, None] + np.array([0.0, 1.0, 2.0, 5.0])
     off = ph.simulate(ph.Scene(inertia), on.last, ts, until=ph.Event(height(0.0), -1))
-    turned = np.array([0.25 * 4**2 / 2, 0.75 + 0.25 / 2])  # at the switch; body x falls at 2 pi k
+    # angles at the switch; the height of body x falls through zero at 2 pi k
+    turned = np.array([0.25 * 4**2 / 2, 0.75 + 0.25 / 2])
     want = np.array([4.0, 1.0]) + (2 * np.pi - turned)
     reached_again = want < np.asarray(ts[:, -1])
     assert reached_again.tolist() == [True, False]
@@ -172,7 +173,7 @@ def test_a_motion_in_steps_goes_on_in_closed_form():
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_intervals_with_a_minimum_near_zero_are_searched(side):
-    """Of (t - 0.3)^2 + lowest and of its negative, each on [0, 1], a cubic through their ends."""
+    """The cubics through the ends of [0, 1] of (t - 0.3)^2 + lowest and of its negative."""
     lowest = np.array([-0.05, 0.0, 0.04, 0.05, 0.2])
     ends, slopes = np.array([0.09, 0.49]) + lowest[:, None], np.array([[-0.6, 1.4]])
     times, sides = np.array([[0.0, 1.0]]), np.full((5, 2), side)
@@ -182,8 +183,9 @@ def test_intervals_with_a_minimum_near_zero_are_searched(side):
 
 @pytest.mark.slow
 def test_the_work_follows_from_the_event_and_not_from_the_last_time():
-    """Two pendulums from rest, in a span of 1e9 s: simulated to its end they would swing for
-    months; a quarter of their periods by SciPy."""
+    """Two pendulums from rest with a last time of 1e9 s, which would take far too many steps. The
+    events are at a quarter of their periods (SciPy).
+    """
     angles = np.array([1.0, 2.5])
     wxyz = np.stack([np.cos(angles / 2), np.sin(angles / 2), 0 * angles, 0 * angles], axis=-1)
     below = ph.Event(lambda wxyz, omega_body, t: wxyz[1] * wxyz[0])
@@ -201,7 +203,7 @@ def test_the_work_follows_from_the_event_and_not_from_the_last_time():
 
 @pytest.mark.slow
 def test_bodies_that_are_set_in_motion_are_looked_at_often_enough():
-    """From rest w = a t, and from rest by a pulse amid a span a thousand times as long."""
+    """From rest with w = a t, and from rest by a pulse within a span a thousand times as long."""
     scene = ph.Scene(ph.Inertia.spherical(2.0), None, ph.BodyTorque([0.0, 1.0, 0.0]))
     rest = ph.State([1.0, 0, 0, 0], jnp.zeros(3))
     high = ph.Event(height(0.5), 1)  # -sin(t^2/4) = 1/2 for the first time rising
@@ -216,7 +218,7 @@ def test_bodies_that_are_set_in_motion_are_looked_at_often_enough():
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.slow
 def test_beyond_its_event_a_body_holds_the_state_of_the_event(way):
-    """A ball that turns at rates of both signs: two of three bodies meet the event."""
+    """Balls with rates of both signs: two of three bodies have the event."""
     rates = jnp.array([0.6, 1.3, 0.0])
     state = ph.State(STATE.wxyz, jnp.stack([0 * rates, way * rates, 0 * rates], axis=-1))
     traj = ph.simulate(BALL, state, [0.0, way * 20.0], until=ph.Event(Height(jnp.asarray(0.4))))
@@ -238,10 +240,11 @@ def test_beyond_its_event_a_body_holds_the_state_of_the_event(way):
     assert float(wait) == 0
 
 
-@pytest.mark.slow  # of crossings: test_event_times_have_derivatives
+@pytest.mark.slow  # faster: test_event_times_have_derivatives
 def test_derivatives_of_a_motion_that_stops():
-    """At a fixed phase x = rate t: dt/drate = -t/rate; the attitude is the phase's, the same for
-    every rate, and moves with the level."""
+    """At a fixed phase x = rate t: dt/drate = -t/rate. The attitude is that of the phase, which
+    does not depend on the rate, and changes with the level.
+    """
 
     def stop(rate, level):
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
@@ -264,7 +267,7 @@ def test_derivatives_of_a_motion_that_stops():
     np.testing.assert_allclose(times[1:], [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
 
 
-@pytest.mark.slow  # two derivatives are taken first; those of states: tests/free
+@pytest.mark.slow  # faster: second derivatives of states, tests/free
 @pytest.mark.parametrize(("call", "modes"), [("crossings", "fff"), ("until", "ffr")])
 def test_third_derivatives_of_events_are_refused(call, modes):
     def time_of(rate):
@@ -288,7 +291,7 @@ def test_third_derivatives_of_events_are_refused(call, modes):
 
 @pytest.mark.slow
 def test_second_derivatives_of_events():
-    """Of times, states and slopes, by the closed form of a ball."""
+    """Of times, states and slopes, against the closed form of a ball."""
 
     def known_of(given):
         rate, level = given
@@ -314,7 +317,7 @@ def test_second_derivatives_of_events():
 
 @pytest.mark.slow
 def test_second_derivatives_of_the_event_of_a_stepped_top():
-    """Of time and attitude, by central differences of first derivatives."""
+    """Of time and attitude, against central differences of first derivatives."""
 
     def stop(rate):
         state = ph.State([np.cos(0.5), np.sin(0.5), 0.0, 0.0], jnp.stack([0.1, rate, 0.3]))
@@ -334,7 +337,7 @@ def test_second_derivatives_of_the_event_of_a_stepped_top():
 
 
 class Edge(eqx.Module):
-    """Of a dead zone of yaw and rate; on which ``side`` is a leaf, which a scan may change."""
+    """Edge of a dead zone of yaw and rate; ``side`` is a leaf, which a scan may change."""
 
     side: jax.Array
 
@@ -343,7 +346,7 @@ class Edge(eqx.Module):
 
 
 def switching_times(leak, pushes, sides):
-    """Roots of a + b s + c s^2 of each leg, by NumPy."""
+    """Roots of a + b s + c s^2 for each leg, by NumPy."""
     yaw, rate, t, times = 0.0, 0.0, 0.0, []
     for push, side in zip(pushes, sides):
         gain = (leak + push) / 2.5
@@ -356,7 +359,7 @@ def switching_times(leak, pushes, sides):
 
 @pytest.mark.slow
 def test_switching_in_a_scan_has_derivatives():
-    """On, off, on, off under jit, lax.scan and reverse mode: by the leak."""
+    """On, off, on, off under jit, lax.scan and reverse mode, with respect to the leak."""
     pushes, sides = jnp.array([0.0, -0.1] * 2), jnp.array([1.0, -1.0] * 2)
 
     @jax.jit
@@ -390,7 +393,7 @@ def test_a_batch_on_two_devices_stops_as_on_one():
         assert case["away"] < 1e-12, name
         assert case["same"], name  # status, and which bodies meet their event
         assert case["met"] == [True, True, False, True], name
-        assert case["kept"], name  # each body stays where it is
+        assert case["kept"], name  # the sharding is unchanged
 
 
 def test_what_is_never_met_is_given_up(monkeypatch):
@@ -441,7 +444,7 @@ def below(limit, **options):
 
 
 def test_events_of_a_simulation_in_order_of_time():
-    """The times are known; a terminal one ends the motion, the samples after it are its own."""
+    """The times are known; a terminal event ends the motion and all later samples repeat it."""
     state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))
     events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
     traj = ph.simulate(slowing(), state, jnp.linspace(0.0, 15.0, 16), events=events)
@@ -462,7 +465,7 @@ def test_events_of_a_simulation_in_order_of_time():
 
 
 def test_the_end_of_a_motion_in_steps_has_a_derivative():
-    """Without ``jit``, as a user takes it first."""
+    """Without ``jit``, as in a user's first call."""
     state = ph.State([1.0, 0, 0, 0], [0.0, 0, 1.0])
 
     def time(rate):
@@ -473,7 +476,7 @@ def test_the_end_of_a_motion_in_steps_has_a_derivative():
     np.testing.assert_allclose(slope, -100 * np.log(2), rtol=1e-7)
 
 
-@pytest.mark.slow  # of one event: above
+@pytest.mark.slow  # faster: one event, above
 def test_times_of_events_of_a_motion_in_steps_have_derivatives():
     events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
     state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))
@@ -490,9 +493,9 @@ def test_times_of_events_of_a_motion_in_steps_have_derivatives():
     np.testing.assert_allclose(slope, -100 * np.log(4), rtol=1e-7)
 
 
-@pytest.mark.slow  # of a motion in steps: above
+@pytest.mark.slow  # faster: integrated motions, above
 def test_events_of_a_motion_in_closed_form():
-    """The same as those of each event alone, merged; the terminal one cuts the rest."""
+    """The merged events of searches for each event alone, up to the terminal one."""
     state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 6.0])
     rises = ph.Event(lambda wxyz, omega, t: omega[0], 1)
     falls = ph.Event(lambda wxyz, omega, t: omega[1], -1)
@@ -514,7 +517,7 @@ def test_events_of_a_motion_in_closed_form():
 
 @pytest.mark.slow
 def test_more_events_than_are_stored_are_reported():
-    """With the true count, and never silently."""
+    """The count is the true one, and a status reports the excess."""
     state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 3.0])
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, ph.LinearDamping(1e-3))
     few = ph.Event(lambda wxyz, omega, t: omega[0], 0, capacity=2)
@@ -547,7 +550,7 @@ def test_a_terminal_event_is_stored_when_the_places_are_taken(torque):
 
 @pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_an_event_where_a_relay_turns_has_the_derivatives_of_the_motion_before(mode):
-    """w' = (0.3, 0, 0.05) up to the event, w_0 = 1/2, beyond which the torque is another one."""
+    """w' = (0.3, 0, 0.05) up to the event at w_0 = 1/2, beyond which the torque is different."""
 
     def end(rates):
         below, above = jnp.array([0.3, 0.0, 0.05]), jnp.array([-0.6, 0.1, 0.0])
@@ -563,7 +566,7 @@ def test_an_event_where_a_relay_turns_has_the_derivatives_of_the_motion_before(m
 
 
 def test_bad_input_is_told_where_events_are_searched_for():
-    """Under jit, where nothing is raised."""
+    """Under jit, where a wrong state raises no error."""
     event = ph.Event(lambda wxyz, omega, t: t - 1.5, samples=20)
 
     @jax.jit
@@ -613,7 +616,7 @@ def test_options_of_an_event_are_checked():
 
 @pytest.mark.parametrize(("capacities", "terminal"), [((1, 10), False), ((1, 2), True)])
 def test_events_share_their_places_in_closed_form_too(capacities, terminal):
-    """More of one event than its own capacity are stored while there is room; all are counted."""
+    """An event may use storage that the capacity of others leaves free; all events are counted."""
     events = [
         ph.Event(lambda wxyz, omega, t: jnp.sin(3 * t), capacity=capacities[0], samples=200),
         ph.Event(lambda wxyz, omega, t: t - 4.5, capacity=capacities[1], terminal=terminal),
@@ -625,7 +628,7 @@ def test_events_share_their_places_in_closed_form_too(capacities, terminal):
     places = sum(capacities)
     kept = np.array(times[:places])
     if terminal:
-        kept[-1] = 4.5  # where the motion ends is stored in any case
+        kept[-1] = 4.5  # the terminal event is always stored
     np.testing.assert_allclose(traj.events.times[: kept.size], kept, atol=1e-12)
     assert not np.isfinite(traj.events.times[kept.size :]).any()
     assert traj.events.times.shape == (places,)
@@ -638,7 +641,7 @@ def test_events_share_their_places_in_closed_form_too(capacities, terminal):
 
 
 def test_an_event_at_the_time_of_a_terminal_one_is_listed():
-    """Also where the terminal one stands first."""
+    """Also if the terminal event is the first in the list."""
     ends = ph.Event(lambda wxyz, omega, t: t - 2.5, samples=50, terminal=True)
     same = ph.Event(lambda wxyz, omega, t: 2.5 - t, samples=50)
     scene = ph.Scene(ph.Inertia.spherical(2.0))
@@ -650,7 +653,7 @@ def test_an_event_at_the_time_of_a_terminal_one_is_listed():
 
 @pytest.mark.parametrize("depth", [pytest.param(0.3, marks=pytest.mark.slow), 0.999999])
 def test_a_motion_in_closed_form_stops_at_its_first_event(depth):
-    """Also at one of two crossings between two looks, which only the turning point shows."""
+    """Also at one of two crossings between two samples, which only the turning point reveals."""
     scene, state = ph.Scene(ph.Inertia.spherical(2.0)), ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.0])
 
     def height(wxyz, omega, t):
@@ -661,7 +664,7 @@ def test_a_motion_in_closed_form_stops_at_its_first_event(depth):
 
 
 def test_pairs_of_events_that_no_sample_shows_have_their_states():
-    """A direction that dips below a plane for a three thousandth of a turn."""
+    """A direction that is below a plane for a three-thousandth of a revolution."""
     scene, depth = ph.Scene(ph.Inertia.spherical(2.0)), 1 - 5e-7
     below = ph.Event(
         lambda wxyz, omega, t: rotation.rotate(wxyz, jnp.array([1.0, 0.0, 0.0]))[0] + depth,
@@ -687,7 +690,7 @@ def test_pairs_of_events_that_no_sample_shows_have_their_states():
     ],
 )
 def test_times_before_an_event_are_known_from_any_samples(by_steps, way):
-    """Samples in another order, or at the event alone, do not show which way the motion goes."""
+    """Samples in another order, or only at the event, do not determine the direction of time."""
     torque = ph.LinearDamping(0.0) if by_steps else None
     scene = ph.Scene(BALL.inertia, torque=torque)
     traj = ph.simulate(scene, STATE, way * TS, until=ph.Event(height(-way * 0.5)))
@@ -725,7 +728,7 @@ def test_the_direction_of_an_event_and_that_of_the_search_agree():
 
 @pytest.mark.slow
 def test_functions_that_vanish_together_have_one_event_each():
-    """The same height in four ways, which differ by rounding, at every crossing in turn."""
+    """The same height by four formulas that differ by rounding, at every crossing."""
     up = jnp.array([0.0, 0.0, 1.0])
     functions = [
         lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, up)[2],

@@ -1,4 +1,4 @@
-"""What trajectories are written as: labels in xarray, SciPy's rotations, CCSDS messages."""
+"""Export of trajectories: labels in xarray, SciPy's rotations, CCSDS messages."""
 
 from datetime import datetime, timedelta
 
@@ -65,7 +65,7 @@ def parsed(text):
 
 
 def test_a_message_of_the_ccsds_holds_the_motion(traj, tmp_path):
-    """Read back by its rules; A2B turns components in space to components in the body."""
+    """Read back by the standard; A2B maps components in space to components in the body."""
     path = tmp_path / "bodies.aem"
     traj.to_aem(path, "2029-04-13T21:46:00.25", **FIELDS, center_name="EARTH")
     head, segments = parsed(path.read_text("ascii"))
@@ -124,7 +124,7 @@ def test_messages_that_nobody_could_read_are_not_written(traj, tmp_path):
 
 
 def test_messages_of_other_centuries(traj, tmp_path):
-    """Nanoseconds in 64 bits hold the years 1678 to 2262 only, and wrap."""
+    """Nanoseconds in 64 bits represent the years 1678 to 2262 only, and overflow."""
     path, start = tmp_path / "far.aem", "START_TIME = "
     shift = float(traj.ts[0])
     for epoch in ("2300-01-01T00:00:00", "1600-02-28T23:59:59", "0001-01-01T00:00:00.5"):

@@ -1,4 +1,4 @@
-"""What works with the core dependencies alone, and which extra the other errors name."""
+"""What works with the core dependencies alone, and the extras that other errors name."""
 
 import re
 import subprocess
@@ -13,7 +13,7 @@ from polhode import _extras
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-# imported together with one of the extras, so that they cannot be what a wheel alone brings
+# some extras import these, so they cannot be core dependencies
 BLOCKED = {"pandas", "numcodecs", "PIL", "click"}
 
 SCRIPT = '''
@@ -109,12 +109,12 @@ def test_every_extra_that_a_message_names_exists():
     for path in (ROOT / "src").rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         for extras in re.findall(r"(?:\bextra=|how_to_install\()[\"']([\w,]+)[\"']", text):
-            named |= set(extras.split(",")) - {"forbid"}  # a setting of pydantic
+            named |= set(extras.split(",")) - {"forbid"}  # a setting of pydantic, not an extra
     assert {"cli", "scale", "plot", "mesh"} <= named <= set(EXTRAS)
 
 
 def test_all_holds_every_extra():
-    """But for MuJoCo, a simulator of its own, which few need."""
+    """Except MuJoCo, a complete simulator that few users need."""
     (everything,) = EXTRAS["all"]
     assert set(re.findall(r"\w+", everything)) - {"polhode"} == set(EXTRAS) - {"all", "robots"}
 

@@ -1,4 +1,4 @@
-"""What bodies that fail give to gradients: nothing, and NaN if all of them do."""
+"""Gradients of batches with failed bodies: these contribute nothing; NaN if all bodies fail."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ RATES[:, 0] = 0.3 * np.abs(RATES[:, 0])
 
 
 def feedback(law):
-    """Scene parts of a strength: a torque of strength and rates."""
+    """Scene parts with a torque of this strength that depends on the rates."""
     return lambda c: {"torque": ph.FeedbackTorque(lambda t, wxyz, omega: law(c, omega))}
 
 
@@ -44,7 +44,7 @@ mixing = feedback(lambda c, omega: (c * jnp.asarray(MIX)) @ omega**3)
 braked = feedback(lambda c, omega: -c * omega * abs(omega))
 undefined = feedback(lambda c, omega: -c * omega * jnp.log(0.9 - omega[0]))
 
-# The parts of the scene, the factor of the rates (1, 0.5, 0.3) that fails, and the status.
+# Parts of the scene, factor of the rates (1, 0.5, 0.3) with which a body fails, and its status.
 CASES = {
     "steps too short": (growing, 40.0, ph.Status.STEP_FAILED),
     "steps too short, a matrix": (mixing, 40.0, ph.Status.STEP_FAILED),
@@ -59,7 +59,7 @@ CASES = {
 
 
 def simulated(scene, wxyz, omega, way):
-    """Times, what is left of each body (N, 3), and its status."""
+    """Times, remaining state of each body (N, 3), and its status."""
     state, ts = ph.State(wxyz, omega), [0.0, 0.5, 1.0]
     if way == "vmap":
         motion = jax.vmap(lambda q, w: ph.simulate(scene, ph.State(q, w), ts))(wxyz, omega)
@@ -77,12 +77,12 @@ def simulated(scene, wxyz, omega, way):
 
 
 SLOW = pytest.mark.slow
-# Where no other body shares the steps, midpoint steps become too short before a number overflows.
+# If bodies do not share steps, midpoint steps become too short before a number overflows.
 REFUSED = {
     "weight, overflow": ("batch", "vmap", "saved", "between"),
     "wheel, overflow": ("batch", "saved", "between"),
 }
-# of others: solvers/test_switches.py::test_tangents_of_a_failed_body_are_no_zeros
+# with switches: solvers/test_switches.py::test_tangents_of_a_failed_body_are_no_zeros
 FAST = ("NaN in closed form",)
 
 

@@ -1,6 +1,6 @@
-"""Imports go one way: a module uses only what stands before it in the table of CONTRIBUTING.md.
+"""Imports go one way: a module uses only modules that precede it in the table of CONTRIBUTING.md.
 
-And the structure of the tests: public names, and one folder for tests that read programs.
+Further rules: tests import public names, and only one folder of tests reads compiled programs.
 """
 
 import ast
@@ -19,7 +19,7 @@ FACE = "__init__"
 
 
 def house() -> list[str]:
-    """Rooms (folders, and files at the root of the package) in the order of the table."""
+    """Modules (folders, and files at the root of the package) in the order of the table."""
     text = CONTRIBUTING.read_text(encoding="utf-8")
     section = text.partition("## Modules")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| *\d+ *\|([^|]*)\|", section, re.M)
@@ -35,14 +35,14 @@ def rooms() -> set[str]:
 
 
 def imported(text: str, package: tuple[str, ...], known: set[str]) -> Iterator[str]:
-    """Rooms that a module of ``package`` imports anywhere in its text, in whatever form."""
+    """Modules that a module of ``package`` imports anywhere in its text, in any form."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
             modules = [name.name.split(".") for name in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = list(package[: len(package) + 1 - node.level]) if node.level else []
             base = above + (node.module.split(".") if node.module else [])
-            # every module may ask for the version: the package stands before its modules
+            # every module may import the version, which the package defines first
             modules = [[*base, name.name] for name in node.names if name.name != "__version__"]
         else:
             continue
@@ -106,7 +106,7 @@ def parsed_tests() -> list[tuple[Path, ast.Module]]:
 
 
 def test_tests_import_public_names_from_where_they_are_public():
-    """What is private is imported only where a formula or a kernel is tested by itself."""
+    """Private names are imported only to test a formula or a kernel on its own."""
     wrong, seen = [], 0
     for path, tree in parsed_tests():
         for node in ast.walk(tree):
@@ -122,7 +122,7 @@ def test_tests_import_public_names_from_where_they_are_public():
 
 
 def test_programs_are_read_in_one_folder():
-    """What a program contains is asserted in ``tests/xla``; elsewhere tests check results."""
+    """The contents of compiled programs are tested in ``tests/xla``; other folders test results."""
     readers = {
         path.as_posix()
         for path, tree in parsed_tests()
@@ -176,7 +176,7 @@ def absences(text: str) -> list[str]:
 
 
 def test_protocols_are_classes():
-    """What an object can do is said by its class, not by attributes that others lack."""
+    """A class declares what an object can do; no attribute is optional."""
     assert absences("getattr(solver, 'spanning', None)") == ["spanning"]
     found = {
         str(path.relative_to(SOURCE)): names

@@ -1,4 +1,4 @@
-"""Bad input gets a clear error: what was given, what is expected, how to mend it."""
+"""Wrong input raises a clear error: what was passed, what is expected, how to correct it."""
 
 import re
 from functools import partial
@@ -114,7 +114,7 @@ def test_mixed_dtypes_and_batches_that_do_not_fit():
 
 
 def test_lists_of_single_precision_stay_so():
-    """Python's own numbers take the default precision, those of NumPy keep theirs."""
+    """Python numbers have the default precision; NumPy numbers keep theirs."""
     for kind in (np.float32, np.float64):
         row = list(np.array([1.0, 1.5, 2.0], kind))
         assert ph.Inertia.from_moments(row).moments.dtype == kind
@@ -123,7 +123,7 @@ def test_lists_of_single_precision_stay_so():
 
 
 def test_the_length_of_a_quaternion_keeps_its_digits_and_has_no_derivative():
-    """Also of a unit quaternion, which is not normalised again."""
+    """Also for a unit quaternion, which is not normalised again."""
     rows = np.random.default_rng(0).normal(size=(100, 4))
     state = ph.State(rows, np.zeros(3))
 
@@ -142,7 +142,7 @@ def test_non_unit_quaternions_are_normalised_at_every_scale():
 
 
 def _parts(box, vertices, faces):
-    """One of every part that checks its values, from arrays that are known."""
+    """One instance of every part that checks its values, from arrays that are not traced."""
     upright, up, number = jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 0, 1]), jnp.array(0.01)
     inertia = ph.Inertia.from_moments(box)
     angles = jnp.array(0.1), jnp.array(0.2), jnp.array(0.3)
@@ -164,7 +164,7 @@ def _parts(box, vertices, faces):
 
 
 def test_parts_are_made_of_known_arrays_under_jit():
-    """What a traced function closes over is known, yet operations on it are traced."""
+    """A traced function closes over concrete arrays, but operations on them are traced."""
     box = jnp.array([1.0, 1.5, 2.0])
     vertices = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -272,7 +272,7 @@ def test_half_precision_is_refused_by_name(dtype):
 
 
 def test_times_that_single_precision_does_not_resolve_are_refused():
-    """Steps of 0.02 s of a clock that has run for a day; those of a motion from zero pass."""
+    """Steps of 0.02 s after a day are rejected; the same steps from zero are accepted."""
     times = np.linspace(0.0, 2.0, 101)
     state = jax.tree.map(lambda x: x.astype(np.float32), STATE)
     scene = jax.tree.map(lambda x: x.astype(np.float32), SCENE)
@@ -312,7 +312,7 @@ def acted(torque):
 
 PLATES = ph.Plates([1.0], [[1.0, 0, 0]], [[0, 0.1, 0]])
 FIELD = [0.0, 0, 1e-5]
-LIMITS = {  # a scene of two numbers that comparisons alone see, and numbers that are right
+LIMITS = {  # a scene with two numbers that occur in comparisons only, and valid numbers
     "motor": (with_motor, [0.05, 10.0]),
     "pulse": (lambda a, b: acted(ph.Pulses(ph.BodyTorque([1.0, 0, 0]), a, b)), [0.2, 0.5]),
     "rods": (
@@ -376,8 +376,9 @@ def test_limits_and_edges_that_are_wrong_have_a_status_where_they_are_traced(nam
 
 
 def test_a_body_with_a_wrong_limit_adds_nothing_to_the_gradient_of_the_others():
-    """A gain that bodies share, a weight of the cost, and limits of each motor; the mean and the
-    derivative by the weight are NaN if all are wrong."""
+    """Derivatives with respect to a shared gain, a weight of the cost, and limits of each motor. If
+    all limits are wrong, the mean and the derivative with respect to the weight are NaN.
+    """
 
     @jax.jit
     @partial(jax.value_and_grad, argnums=(0, 1))
@@ -501,7 +502,7 @@ def test_numbers_put_in_by_an_edit_raise_where_the_scene_is_used(field, value, u
 
 @pytest.mark.slow
 def test_scenes_hold_anything_while_they_are_not_used():
-    """Masks, axes and names stand where arrays are: for tree_map, in_axes and optax."""
+    """tree_map, in_axes and optax put masks, axes and names in the place of arrays."""
     mask = jax.tree.map(lambda x: x.ndim > 0, TOP)
     assert mask.torque.c is True
     axes = jax.tree.map(lambda _: None, TOP)
@@ -555,9 +556,9 @@ garbage = st.one_of(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(first=garbage, second=garbage)
-@example(first=[1.0, 1.5, 2.0], second=[0.1, 0.0, 0.3])  # what constructors accept
+@example(first=[1.0, 1.5, 2.0], second=[0.1, 0.0, 0.3])  # valid input
 def test_garbage_never_passes_silently(unchecked, first, second):
-    """A constructor raises ValueError or TypeError, or holds finite arrays of the right rank."""
+    """A constructor raises ValueError or TypeError, or has finite arrays of the right rank."""
     makers = [
         lambda: ph.State(first, second),
         lambda: ph.UniformGravity(first, second),

@@ -1,4 +1,4 @@
-"""The table of mutants holds formulas of the package and tests that exist."""
+"""The mutants change formulas that the package contains, and name tests that exist."""
 
 import ast
 

@@ -1,6 +1,6 @@
-"""Stored outputs of the notebooks are those of this code; notebooks run without the repository.
+"""The stored outputs of the notebooks are those of this code; notebooks run without the repository.
 
-See ``tests/stored_outputs.py``, which executes the notebooks.
+``tests/stored_outputs.py`` executes the notebooks.
 """
 
 import re
@@ -45,7 +45,7 @@ def test_a_notebook_is_its_text_form_executed_with_this_interface(name):
     assert (FOLDER / f"{name}.ipynb").stat().st_size < LIMIT
 
 
-SECONDS = {"quick_start"}  # the one that the fast lane executes
+SECONDS = {"quick_start"}  # executed among the fast tests
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What the package says of itself: types, version, licences, links, interpreters, floors."""
+"""Metadata of the package: types, version, licences, links, interpreters, lowest versions."""
 
 import os
 import re
@@ -41,7 +41,7 @@ def test_the_mark_stands_beside_the_modules():
 
 @pytest.mark.parametrize(("tag", "code"), [(f"v{polhode.__version__}", 0), ("v99.0", 1)])
 def test_the_release_workflow_compares_tag_and_version(tag, code):
-    """Its own line is run, in the folder where it runs."""
+    """The test runs the line of the workflow in the folder in which the workflow runs it."""
     text = (WORKFLOWS / "release.yml").read_text(encoding="utf-8")
     (line,) = re.findall(r"- name: the tag is the version\n +run: (.+)\n", text)
     environment = os.environ | {"GITHUB_REF_NAME": tag}
@@ -56,7 +56,7 @@ def test_workflows_and_make_name_files_that_exist():
 
 
 def test_the_version_stands_in_one_place():
-    """`polhode --version` reads it without the metadata of the installation, so it is fast."""
+    """`polhode --version` is fast because it does not read the metadata of the installation."""
     assert "version" in PROJECT["dynamic"]
     found = re.findall(r'^__version__ = "(.+)"$', read("src/polhode/__init__.py"), re.M)
     assert found == [polhode.__version__]

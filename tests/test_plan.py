@@ -1,4 +1,4 @@
-"""The choice of the method: by types alone, the same in every call, and explained."""
+"""The choice of the method: by types only, the same in every call, and explained."""
 
 import diffrax
 import jax
@@ -58,7 +58,7 @@ ALIKE = {
 }
 
 
-ALIKE_FAST = (  # one of each method, and what only numbers make symmetric
+ALIKE_FAST = (  # one of each method, and bodies that are symmetric by their numbers only
     *("free", "free, symmetric", "with a wheel", "gyrostat", "equal moments", "no weight"),
     *("no gravity", "wheel on z", "axial damping"),
 )
@@ -76,7 +76,7 @@ ALIKE_FAST = (  # one of each method, and what only numbers make symmetric
     ],
 )
 def test_plain_calls_jit_vmap_and_grad_choose_alike(name, rtol):
-    """By types alone: no number of scene, state or times, however long, decides. Nothing is run."""
+    """No number of scene, state or times affects the choice. Nothing is simulated."""
     scene, expected = ALIKE[name]
     state, ts = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.7]), jnp.array([0.0, 1e9])
 
@@ -101,7 +101,9 @@ def test_plain_calls_jit_vmap_and_grad_choose_alike(name, rtol):
 
 
 def test_specialise_says_by_constructors_what_numbers_say():
-    """The narrower scene moves alike, in closed form; explain names its constructors before."""
+    """The specialised scene has the same motion, in closed form; explain names its constructors for
+    the original scene.
+    """
     wheels = ph.Rotor([0.0, 0.0, 2.0], 0.1, speed=0.3) + ph.Rotor([0.0, 0.0, 1.0], momentum=0.1)
     scene = ph.Scene(EQUAL, ON_AXIS, rotors=wheels)
     state, ts = ph.State([0.6, 0, 0.8, 0], [0.2, 0.1, 3.0]), [0.0, 1.0, 2.0]
@@ -160,7 +162,7 @@ def test_specialise_keeps_what_is_no_narrower_and_refuses_traced_numbers():
 
 @pytest.mark.slow
 def test_gradients_across_absent_gravity_are_nan_and_those_along_the_axis_right():
-    """The frame of the field has no direction then: never a number that is wrong."""
+    """Zero gravity has no direction: such derivatives are NaN, never wrong numbers."""
     state, ts = ph.State([1.0, 0, 0, 0], [0.1, 0.2, 0.3]), [0.0, 1.0]
 
     def loss(gravity, mass=1.0):
@@ -178,7 +180,7 @@ def test_gradients_across_absent_gravity_are_nan_and_those_along_the_axis_right(
 
 
 def test_a_tolerance_near_rounding_has_compensated_frequencies():
-    """1e6 rad: the rounded phase is off by 2e-10 rad, far beyond 1e-12 and well within 1e-9."""
+    """After 1e6 rad the error of the rounded phase is 2e-10 rad: above 1e-12 and below 1e-9."""
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
     state, ts = ph.State([1.0, 0, 0, 0], [0.0, 0.6, 0.8]), jnp.array([0.0, 1e6])
     assert choose(scene, 1e-12)[0].compensated
@@ -192,14 +194,14 @@ def test_a_tolerance_near_rounding_has_compensated_frequencies():
     assert 1e-13 < apart < 1e-9
 
 
-@pytest.mark.slow  # random bodies: solvers/test_error_control
+@pytest.mark.slow  # faster: random bodies, solvers/test_error_control
 def test_many_bodies_under_a_potential_reach_the_error_asked_for():
-    """The planner's steps for 40 heavy tops against the exact state of the systems table."""
+    """The default method for 40 heavy tops against the exact state of the table of systems."""
     from systems.table import BY_NAME, truth
 
     system, exact = BY_NAME["heavy_asymmetric_top"], truth("heavy_asymmetric_top")
     weight, centre = system.acts["gravity"]
-    # the same top, seen from a frame lying on its side
+    # the same top, in space axes rotated by a quarter turn
     side = rotation.axis_angle_to_wxyz(jnp.array([0.6, 0.8, 0.0]), jnp.array(1.25))
     down = rotation.rotate(side, jnp.array([0.0, 0.0, -1.0]))
     scene = ph.Scene(
@@ -257,14 +259,14 @@ def test_explain_says_what_runs_what_is_skipped_and_why():
 
 
 class Own(ph.AbstractMethod):
-    """A stepped method of a user, without chart, solver or controller."""
+    """A user-defined integrating method without coordinates, solver or controller."""
 
     def run(self, scene, state, ts, rtol, record):
         raise NotImplementedError
 
 
 def test_explain_knows_the_method_of_a_user():
-    """It asks of it what every method has, and promises no error in its name."""
+    """explain uses only attributes of every method, and states no error for it."""
     plan = ph.explain(ph.Scene(ph.Inertia.from_moments([1.0, 2, 3])), states(1), [0.0, 1.0], Own())
     assert "runs    Own: as requested" in str(plan)
     assert plan.error == "unknown: the requested steps do not follow from rtol"
@@ -281,7 +283,7 @@ def test_explain_says_that_steps_of_another_solver_pass_jumps():
 
 
 def test_explain_says_why_no_exact_law_holds():
-    """Every row of the table is named once, each with a reason of its own; none where one runs."""
+    """Every closed form is named once with its reason; none is named if a closed form runs."""
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.UniformGravity(1.0, [0, 0, 1.0]))
     stepped = ph.explain(scene, states(1), [0.0, 1.0])
     assert [line.partition(":")[0] for line in stepped.refused] == [
@@ -300,9 +302,11 @@ def test_explain_says_why_no_exact_law_holds():
     [ph.Inertia.axisymmetric(2.0, 0.5), ph.Inertia.spherical(2.0)],
     ids=["axial", "sphere"],
 )
-@pytest.mark.slow  # other symmetric bodies: tests/systems and tests/free
+@pytest.mark.slow  # faster: other symmetric bodies, tests/systems and tests/free
 def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
-    """The programs for known symmetry agree with the general one (itself held to 50 digits)."""
+    """The programs for declared symmetry agree with the general one, which is tested against 50
+    digits.
+    """
     general = ph.Inertia.from_moments(inertia.moments)
     state, ts = states(5), jnp.linspace(0.0, 20.0, 4)
 
@@ -322,7 +326,7 @@ def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
 
 @pytest.mark.parametrize("bodies", [1, pytest.param(5_000, marks=pytest.mark.slow)])
 def test_known_states_and_times_may_be_closed_over_under_jit(bodies):
-    """The planner looks at values, which every operation under ``jit`` would turn into tracers."""
+    """The choice inspects values, which operations under ``jit`` would turn into tracers."""
     rng = np.random.default_rng(3)
     state = ph.State(rng.normal(size=(bodies, 4)), rng.normal(size=(bodies, 3)))
     ts = jnp.array([0.0, 3.0])
@@ -351,7 +355,7 @@ def test_exact_laws_in_one_chunk():
 
 
 def test_weights_of_a_batch_share_one_direction_of_gravity():
-    """Masses, centres or strengths of many bodies, and a body without weight among them."""
+    """Masses, centres or strengths of many bodies, including a body without weight."""
     state, ts = ph.State([1.0, 0, 0, 0], [0.0, 0.1, 1.0]), [0.0, 1.0]
     down, masses = [0.1, 0.2, -9.0], np.array([1.0, 0.0])
     weights = ph.UniformGravity(masses, [0.1, 0.0, 0.3], down)
@@ -364,8 +368,9 @@ def test_weights_of_a_batch_share_one_direction_of_gravity():
 
 
 def test_explain_names_what_decays_too_fast():
-    """Narrow friction relaxes at torque / speed (1 / J + 1 / (I - J)), which explicit steps follow;
-    a batch has the number of its worst body."""
+    """Narrow friction relaxes at the rate torque / speed (1 / J + 1 / (I - J)), which limits
+    explicit steps; for a batch explain states the rate of the worst body.
+    """
     friction = ph.CoulombFriction(1e-3, 1e-4)
     wheel = ph.Rotor([0.0, 0.0, 1.0], inertia=1e-3, speed=50.0, coupling=friction)
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), rotors=wheel)
@@ -382,7 +387,7 @@ def test_explain_names_what_decays_too_fast():
 
 
 def test_explain_while_a_function_of_the_scene_closes_over_what_is_traced():
-    """How fast it decays is then unknown."""
+    """The rate of decay is then unknown."""
 
     def stiff(gain):
         law = ph.FeedbackTorque(lambda t, wxyz, omega: -gain * omega)

@@ -1,4 +1,4 @@
-"""Choices by platform and measurement: one module, with a reason and a benchmark for each."""
+"""Settings by platform and measurement: one module, with a reason and a benchmark for each."""
 
 import ast
 import os
@@ -23,7 +23,7 @@ INSPECTIONS = {"default_backend", "platform", "device_kind"}
 
 
 def inspections(text: str) -> list[str]:
-    """Attributes of the platform that a module reads, in whatever form it imports them."""
+    """Attributes of the platform that a module reads, however it imports them."""
     tree = ast.parse(text)
     reads = [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
     for node in ast.walk(tree):
@@ -54,7 +54,7 @@ def test_the_platform_is_inspected_in_one_module():
 
 
 def rows(path: Path) -> dict[str, str]:
-    """The constants of a module, each with the text below it."""
+    """The constants of a module, each with the docstring below it."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     texts = {}
     for node, after in zip(body, [*body[1:], None]):
@@ -128,7 +128,7 @@ STATE = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
 
 
 def test_a_program_is_for_the_default_device(monkeypatch):
-    """On a machine with an accelerator arrays may be put on the CPU by the default device."""
+    """On a machine with an accelerator, the default device may be the CPU."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not _policy.is_cpu()
     assert not _policy.is_fused()
@@ -138,7 +138,7 @@ def test_a_program_is_for_the_default_device(monkeypatch):
 
 
 def loops(run) -> int:
-    """Loops of the program that moves 20,000 bodies more than of the one that moves 4."""
+    """Number of loops in the program for 20,000 bodies minus that in the program for 4."""
     counts = []
     for n in (20_000, 4):
         omega = jax.ShapeDtypeStruct((n, 3), float)
@@ -146,9 +146,9 @@ def loops(run) -> int:
     return counts[0] - counts[1]
 
 
-@pytest.mark.slow  # it drops the programs of all tests before it
+@pytest.mark.slow  # it clears the programs of all earlier tests
 def test_an_accelerator_moves_a_batch_side_by_side(monkeypatch):
-    """The chunks of a CPU, one after the other, took a hundred times as long on a GPU."""
+    """Sequential chunks, as on a CPU, took a hundred times as long on a GPU."""
     body, axial = ph.Inertia.from_moments([1.0, 1.5, 2.0]), ph.Inertia.axisymmetric(1.0, 0.5)
     clipped = ph.FeedbackTorque(lambda t, wxyz, omega: jnp.clip(-omega, -0.1, 0.1))
     scenes = (
@@ -177,8 +177,9 @@ def test_an_accelerator_moves_a_batch_side_by_side(monkeypatch):
 
 
 def scene_values() -> list[np.ndarray]:
-    """Values and gradients of a few scenes: closed forms and steps, of one body and of more bodies
-    than SIMD lanes; each scene with one of the two numbers of bodies, as compilation takes long."""
+    """Values and gradients of some scenes: closed forms and integrated motions. Each scene has
+    either one body or more bodies than SIMD lanes, to limit compilation.
+    """
     gravity = ph.UniformGravity(1.0, [0.0, 0.1, 0.5])
     body = ph.Inertia.from_moments([1.0, 1.5, 2.0])
     scenes = {
@@ -206,7 +207,7 @@ def scene_values() -> list[np.ndarray]:
 
 @pytest.mark.slow
 def test_plain_programs_agree_with_optimised_ones(tmp_path):
-    """In a process of its own each: the variable is read while programs are traced."""
+    """Each in its own process, because the variable is read during tracing."""
     results = []
     for variable in ("0", "1"):
         path = tmp_path / f"{variable}.npz"

@@ -1,4 +1,4 @@
-"""One step of a filter: Jacobian against differences of the motion, noise against a push."""
+"""The prediction step of a filter: Jacobian against differences, noise against a small torque."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ DT = 0.7
 
 
 def tangent(nominal, end):
-    """Error rotation vector and rates of a motion's end (NumPy's small differences)."""
+    """Error rotation vector and rate errors of the final state (small differences in NumPy)."""
     turn = rotation.multiply(rotation.conjugate(nominal.wxyz), end.wxyz)
     turn = rotation.wxyz_to_rotation_vector(turn)
     return np.concatenate([turn, end.omega_body - nominal.omega_body])
@@ -66,7 +66,7 @@ def test_jacobian_and_noise_are_those_of_the_motion(potential):
 
 @pytest.mark.slow
 def test_steps_join_and_map():
-    """Two half steps are a whole one; bodies are mapped."""
+    """Two half steps equal one whole step; vmap over bodies."""
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
     step = jax.jit(lambda state, dt: ph.propagate(scene, state, dt))
     whole, half = step(STATE, 2 * DT), step(STATE, DT)
@@ -95,7 +95,7 @@ def test_what_no_step_is_made_of_is_refused():
         ph.propagate(scene, BOTH, DT)
 
 
-# Wheels. The coordinates of those that are not held at their speed follow attitude and rates.
+# Wheels: the coordinates of those without prescribed speed follow attitude and rates.
 
 WHEEL_STATE = ([1.0, 0.2, -0.1, 0.3], [1.0, -0.8, 0.6])
 VISCOUS = ph.Rotor([1.0, 1.0, 0.0], 0.2, speed=3.0, coupling=ph.ViscousCoupling(0.4))
@@ -133,7 +133,7 @@ WHEELS = {
 
 
 def check_wheels(scene, dt, t):
-    """Jacobian and noise against differences of ``simulate``, steps in a row against one."""
+    """Jacobian and noise against differences of ``simulate``, several steps against one."""
     state = ph.State(*WHEEL_STATE)
     wheels = scene.settled(state, jnp.asarray(t)).rotors
     loose = np.array(wheels.loose)
@@ -172,7 +172,7 @@ def check_wheels(scene, dt, t):
     first = ph.propagate(scene, state, dt / 3, t=t, rtol=1e-12)
     then = ph.propagate(scene, first.state, 2 * dt / 3, t=t + dt / 3, rtol=1e-12)
     scale = max(1, abs(step.jacobian).max())
-    moments = np.asarray(wheels.inertia)  # tolerances of speeds are those of momenta
+    moments = np.asarray(wheels.inertia)  # the tolerance applies to momenta, not to speeds
     wxyz, omega, speed = end(*none)
     for last in (step.state, then.state):
         np.testing.assert_allclose(last.wxyz, wxyz, rtol=0, atol=1e-11 * scale)
@@ -183,7 +183,7 @@ def check_wheels(scene, dt, t):
             rtol=0,
             atol=1e-11 * scale,
         )
-    # three runs, each within 10 rtol
+    # three simulations, each with an error below 10 rtol
     units = np.concatenate([np.ones(6), moments[loose]])[:, None]
     joined = units * (then.jacobian @ first.jacobian - step.jacobian)
     np.testing.assert_allclose(joined, 0, rtol=0, atol=3e-11 * scale)
@@ -191,9 +191,9 @@ def check_wheels(scene, dt, t):
     np.testing.assert_allclose(joined, 0, rtol=0, atol=3e-11 * scale)
 
 
-@pytest.mark.slow  # shapes with wheels: below
+@pytest.mark.slow  # faster: shapes with wheels, below
 def test_a_free_wheel_keeps_its_momentum_under_a_disturbance():
-    """Noise of its speed and of the rates against differences; the next step continues with it."""
+    """Noise of its speed and of the rates against differences; a second step continues."""
     scene, dt = wheel_scene(FREE, torque=ph.BodyTorque(jnp.zeros(3))), 0.3
     state = *WHEEL_STATE, [1.0]  # the same structure as what a step returns: one program
     step = ph.propagate(scene, ph.State(*state), dt, rtol=1e-12)
@@ -225,7 +225,9 @@ def test_wheels_of_every_kind(name, dt):
 
 @pytest.mark.slow
 def test_noise_in_closed_form_with_a_free_wheel():
-    """Integrated over the step; a torque that changes nothing makes the same scene stepped."""
+    """Integrated over the step, and compared with the same scene when a zero torque forces
+    integration.
+    """
     scene = ph.Scene(
         ph.Inertia.axisymmetric(1.0, 1.5),
         ph.UniformGravity.axial(1.0, 0.5),
@@ -240,7 +242,7 @@ def test_noise_in_closed_form_with_a_free_wheel():
 
 
 def test_held_wheels_have_no_coordinate_and_parameters_follow():
-    """Shapes: nothing is compiled."""
+    """Shapes only; nothing is compiled."""
     state = ph.State(*WHEEL_STATE)
 
     def shapes(scene, free=None, state=state):
@@ -263,7 +265,7 @@ def test_held_wheels_have_no_coordinate_and_parameters_follow():
 
 @pytest.mark.slow
 def test_a_disturbance_over_many_turns():
-    """In closed form it is integrated over the step: in parts, or it is NaN, but never wrong."""
+    """In closed form the noise is integrated over parts of the step; NaN rather than wrong."""
     scene, state, dt = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2])), STATE, 40.0
     found = ph.propagate(scene, state, dt)
     want = ph.propagate(scene, state, dt, method=ph.LiePoisson(), rtol=1e-12)
@@ -272,7 +274,7 @@ def test_a_disturbance_over_many_turns():
     assert jnp.all(jnp.isnan(traced(dt).noise))
     np.testing.assert_allclose(traced(dt).jacobian, found.jacobian, atol=1e-9)
     assert jnp.all(jnp.isfinite(traced(5.0).noise))
-    assert jnp.all(jnp.isnan(ph.propagate(scene, state, 1e6).noise))  # more parts than memory holds
+    assert jnp.all(jnp.isnan(ph.propagate(scene, state, 1e6).noise))  # too many parts for memory
 
 
 @pytest.mark.parametrize(
@@ -281,7 +283,7 @@ def test_a_disturbance_over_many_turns():
     ids=["free", "damped"],
 )
 def test_a_step_is_not_rounded_after_a_day_in_single_precision(torque):
-    """Where the scene does not depend on time, at which t + dt has three digits of dt."""
+    """If the scene does not depend on time: t + dt has only three digits of dt."""
     inertia = ph.Inertia.from_moments(jnp.ones(3, jnp.float32))
     state = ph.State(*(jnp.asarray(x, jnp.float32) for x in ([1, 0, 0, 0], [0, 0, 1])))
     step = jax.jit(lambda t: ph.propagate(ph.Scene(inertia, torque=torque), state, 0.01, t=t))
@@ -291,7 +293,7 @@ def test_a_step_is_not_rounded_after_a_day_in_single_precision(torque):
 
 @pytest.mark.parametrize("traced", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_step_that_times_do_not_resolve_is_refused(traced):
-    """In a scene that depends on time; under jit it is NaN."""
+    """In a scene that depends on time; under jit the result is NaN."""
     inertia = ph.Inertia.from_moments(jnp.ones(3, jnp.float32))
     scene = ph.Scene(inertia, torque=ph.BodyTorque(lambda t: jnp.sin(t) * jnp.ones(3, t.dtype)))
     state = ph.State(*(jnp.asarray(x, jnp.float32) for x in ([1, 0, 0, 0], [0, 0, 1])))

@@ -1,6 +1,6 @@
-"""Published cases of other systems, textbooks and papers, with their sources and tolerances.
+"""Published cases of other programs, textbooks and papers, with their sources and tolerances.
 
-The numbers are retyped facts; values of 16 digits are 34-digit recomputations of the cases.
+The numbers are retyped; values of 16 digits are 34-digit recomputations of the cases.
 """
 
 import diffrax
@@ -120,7 +120,7 @@ def runs(request):
     """All free cases in one batch, each with its own last time."""
     moments, wxyz, omega, last = (jnp.array([c[i] for c in FREE.values()], float) for i in range(4))
     ts = jnp.stack([jnp.zeros_like(last), last], axis=-1)
-    scene = ph.Scene(ph.Inertia(diagonal=moments))  # (3, 5, 9) is no real body's
+    scene = ph.Scene(ph.Inertia(diagonal=moments))  # no real body has (3, 5, 9)
     return ph.simulate(scene, ph.State(wxyz, omega), ts, request.param, rtol=2e-14)
 
 
@@ -183,7 +183,7 @@ def test_principia_spin_about_each_principal_axis(momentum, turn):
     np.testing.assert_allclose(end.omega_body[-1], state.omega_body, rtol=4e-16)
 
 
-@pytest.mark.slow  # the same case in closed form: tests/tops; tops in steps: tests/systems
+@pytest.mark.slow  # faster: its closed form, tests/tops; integrated tops, tests/systems
 def test_gni_lagrange_top():
     """GNI example VII.5.4 with I = (0.5, 0.5, 1) and U = q_33, t = 30."""
     scene = ph.Scene(
@@ -201,7 +201,8 @@ def test_gni_lagrange_top():
 def test_nasa_brick_beside_five_simulators(shared):
     """NESC check case 2: two of NASA's simulators agree with the exact rates to 4e-10 deg/s.
 
-    Our rates at 10, 20 and 30 s are the 34-digit ones to 1e-12 deg/s (``nasa_brick`` above).
+    polhode's rates at 10, 20 and 30 s agree with 34-digit ones to 1e-12 deg/s (``nasa_brick``
+    above).
     """
     scene = ph.Scene(ph.Inertia.from_moments(BRICK))
     state = ph.State(IDENTITY, np.deg2rad([10.0, 20.0, 30.0]))
@@ -216,7 +217,7 @@ def test_nasa_brick_beside_five_simulators(shared):
         ).max()
     assert errors["sim_01"] < 4e-10, errors
     assert errors["sim_04"] < 4e-10, errors
-    assert 1e-5 < errors["sim_05"] < 1e-4, errors  # the others really are that far off
+    assert 1e-5 < errors["sim_05"] < 1e-4, errors  # the errors of the other simulators
     assert 1e-3 < errors["sim_02"] < 2e-3, errors
     assert 4e-3 < errors["sim_06"] < 5e-3, errors
 
@@ -227,7 +228,7 @@ def test_basilisk_rotation():
     third = -moments * omega / np.linalg.norm(moments * omega)
     second = np.array([-0.1 * third[1] / third[0], 0.1, 0.0])
     second /= np.linalg.norm(second)
-    rows = np.stack([np.cross(second, third), second, third])  # space axes in body components
+    rows = np.stack([np.cross(second, third), second, third])  # space axes along the body axes
     wxyz = rotation.matrix_to_wxyz(jnp.asarray(rows))
     sigma = rotation.wxyz_to_modified_rodrigues(wxyz)
     np.testing.assert_allclose(sigma, (0.09734747, 0.62361776, 0.04678629), rtol=1e-7)
@@ -238,9 +239,10 @@ def test_basilisk_rotation():
 
 
 def test_newton_bar_and_stem_turns_over():
-    """Newton's example_basic_dzhanibekov.py: a bar with a stem, spun about its middle axis.
+    """Newton's example_basic_dzhanibekov.py: a bar with a stem that spins about the intermediate
+    axis.
 
-    It promises at least one flip; the inertia is worked out there from the two capsules as here.
+    The example states at least one flip; as here, it computes the inertia from the two capsules.
     """
 
     def capsule(radius, half, density):
@@ -295,7 +297,8 @@ def test_dojo_and_jax_md_conservation(dtype, bound):
 @pytest.mark.slow
 def test_gyrostat_precession():
     """An axisymmetric gyrostat, wheel along its axis (P. C. Hughes, Spacecraft Attitude Dynamics,
-    chapter 7): the transverse rate turns at ((C - A) s + h)/A in the body."""
+    chapter 7): the transverse rate rotates at ((C - A) s + h)/A in the body.
+    """
     a, c, h, s = 2.0, 3.0, 1.5, 0.4
     scene = ph.Scene(
         ph.Inertia.from_moments([a, a, c]), rotors=ph.Rotor([0.0, 0.0, 1.0], momentum=h)
@@ -324,7 +327,7 @@ def test_satellite_with_products_of_inertia_librates():
     frame = jnp.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     tilt = 1e-6
     start = rotation.multiply(rotation.matrix_to_wxyz(frame), jnp.array([1.0, tilt / 2, 0.0, 0.0]))
-    # at rest in the orbiting frame, which turns by -n about the pitch axis
+    # at rest in the orbit frame, which rotates at -n about the pitch axis
     rate = rotation.rotate(rotation.conjugate(start), jnp.array([0.0, 0.0, n]))
     ts = np.linspace(0.0, 4 * 2 * np.pi / n, 25)
     scene = ph.Scene(ph.Inertia.from_tensor(tensor), ph.GravityGradient(mu, orbit))
@@ -350,7 +353,7 @@ def test_satellite_with_products_of_inertia_librates():
 
 
 # NASA's JEOD (github.com/nasa/jeod, verif/SIM_dyncomp, runs 9A to 10D: orbital check cases of the
-# NESC): place and velocity, matrices from space to body axes, rates in body axes, after 8 hours
+# NESC): position and velocity, matrices from space to body axes, rates in body axes, after 8 hours
 MU = 3.986004415e14
 ORBITS = {
     "circular": ([-4292653.41, 955168.47, 5139356.57], [109.649663, -7527.72649, 1484.521489]),
@@ -445,7 +448,7 @@ def _wxyz(to_body):
 
 @pytest.mark.parametrize("name", LIBRATIONS)
 def test_nasa_cylinder_librates_in_orbit(name):
-    """NESC orbital cases 10A and 10C (at rest to the orbit), 10B and 10D (with a rate)."""
+    """NESC orbital cases 10A and 10C (at rest relative to the orbit), 10B and 10D (with a rate)."""
     where, omega, end, rates = LIBRATIONS[name]
     scene = ph.Scene(
         ph.Inertia.from_moments(CYLINDER),
@@ -462,7 +465,7 @@ def test_nasa_cylinder_librates_in_orbit(name):
 def test_nasa_station_pushed_for_a_while(name):
     """NESC orbital cases 9A and 9B: 10 N m along body x from 1000 to 2000 s.
 
-    The jumps are found by the step control, or stepped to because they are among the times.
+    Either the step control finds the jumps, or steps end there because they are saved times.
     """
     omega, end, rates = THRUSTS[name]
     body = ph.Inertia.from_tensor(STATION)

@@ -1,4 +1,4 @@
-"""What is published works where it is installed: wheel and source archive, the README's lines."""
+"""Wheel and source archive are complete and run the README's examples where they are installed."""
 
 import os
 import re
@@ -58,7 +58,7 @@ def test_installed_it_runs_the_lines_of_the_readme(built, kind, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", readme, re.S | re.M)
-    assert len(blocks) == 2  # the second goes on with the names of the first
+    assert len(blocks) == 2  # the second uses names of the first
     script = tmp_path / "readme.py"
     # its own dependencies come from this environment, polhode from the folder
     where = "import polhode, pathlib; print(pathlib.Path(polhode.__file__).resolve())\n"

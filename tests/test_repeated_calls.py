@@ -1,4 +1,4 @@
-"""Plain calls: one program for a structure, checked input, the results of a compiled call."""
+"""Ordinary calls: one program per structure, checked input, the results of a compiled call."""
 
 import gc
 import weakref
@@ -154,7 +154,7 @@ def test_the_first_sample_is_the_given_state():
 
 
 def test_what_is_asked_of_a_trajectory_is_a_program_or_two(caplog):
-    """Not one for each operation: twenty of an energy are half a second."""
+    """Not one program per operation: twenty operations of an energy would take half a second."""
     weight = ph.UniformGravity(1.0, [0.0, 0.1, 0.5])
     trajectory = ph.simulate(ph.Scene(SCENE.inertia, weight), _state(), jnp.linspace(0, 1, 29))
     asks = (lambda x: x.energy, lambda x: x.momentum_space, lambda x: x.euler())
@@ -167,7 +167,7 @@ def test_what_is_asked_of_a_trajectory_is_a_program_or_two(caplog):
 
 
 def test_what_was_asked_before_compiles_nothing_again(caplog):
-    """Loops with functions of their own would be new programs in every call outside of ``jit``."""
+    """A loop over a new function object would be a new program in every call outside of ``jit``."""
     tensor = np.diag([1.0, 2.0, 3.0]) + 0.1
     orbit = ph.KeplerOrbit(1.0, 2.0, 0.1)
     scene = ph.Scene(SCENE.inertia, ph.GravityGradient(1.0, orbit))

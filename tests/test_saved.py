@@ -25,12 +25,12 @@ SAVE = ph.Record(save=row)
 
 
 def is_fast(trajectory):
-    """1 or 2, also where the rate is not a number."""
+    """1 or 2, also where the rate is NaN."""
     return jnp.where(trajectory.omega_body[:, 2] > 0, 1.0, 2.0)
 
 
 def transverse(omega, ts):
-    """Transverse rates of a symmetric body with moments 1, 1, 2 and without a torque."""
+    """Transverse rates of a free symmetric body with moments 1, 1, 2."""
     turned = np.exp(1j * omega[..., 2, None] * np.asarray(ts)) * (
         omega[..., :1] + 1j * omega[..., 1:2]
     )

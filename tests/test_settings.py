@@ -1,4 +1,4 @@
-"""The guards of the suite are alive: annotations are checked, programs are compiled once a run."""
+"""The settings of the suite are active: annotations are checked, programs are compiled once."""
 
 import inspect
 import os

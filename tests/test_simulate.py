@@ -1,4 +1,4 @@
-"""simulate: batches, times, records, outcomes per body, derivatives, labelled output."""
+"""simulate: batches, times, records, status per body, derivatives, labelled output."""
 
 import functools
 
@@ -28,7 +28,7 @@ def one_by_one(scene_of, n, **kwargs):
     return jnp.stack([r.wxyz for r in runs]), jnp.stack([r.omega_body for r in runs])
 
 
-@pytest.mark.slow  # chunks and vmap: below
+@pytest.mark.slow  # faster: chunks and vmap, below
 def test_batch_equals_single_bodies_in_any_shape():
     """Leaves (3, 1, 3) of inertia, (2, 4) of attitude and (3,) of gravity: 3 x 2 bodies."""
     moments = jnp.array([[[1.0, 1.5, 2.0]], [[2.0, 1.5, 1.0]], [[0.5, 0.5, 0.75]]])
@@ -60,7 +60,7 @@ def test_chunks_with_a_remainder_and_vmap_agree():
     np.testing.assert_allclose(chunked.wxyz, mapped, atol=1e-8)
 
 
-@pytest.mark.slow  # two chunks and a remainder: above
+@pytest.mark.slow  # faster: two chunks and a remainder, above
 def test_one_chunk_and_several_agree():
     rng = np.random.default_rng(0)
     state = ph.State(rng.normal(size=(7, 4)), rng.normal(size=(7, 3)))
@@ -70,10 +70,11 @@ def test_one_chunk_and_several_agree():
     np.testing.assert_allclose(chunked, whole, atol=1e-8)
 
 
-@pytest.mark.slow  # values under vmap: test_chunks_with_a_remainder_and_vmap_agree
+@pytest.mark.slow  # faster: values under vmap, test_chunks_with_a_remainder_and_vmap_agree
 def test_one_attitude_for_many_rates_under_vmap():
-    """What does not depend on the mapped numbers is batched alike in values and derivatives; few
-    bodies within few are integrated as a unit, which can hold no scatter."""
+    """Unmapped arrays are batched in the same way for values and derivatives; small batches within
+    small batches are integrated by one fused program, in which no scatter may occur.
+    """
     omega = np.random.default_rng(5).normal(size=(2, 3, 3))
     inertia = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 
@@ -111,7 +112,7 @@ def test_times_per_body_and_backwards():
 
 
 def test_samples_are_as_accurate_as_steps():
-    """No interpolant: energy at 50 samples keeps to the tolerance of the steps."""
+    """The energy at 50 samples is as accurate as at the ends of the steps."""
     ts = jnp.linspace(0, 20, 50)
     traj = ph.simulate(free(), STATE, ts, METHOD, rtol=1e-12)
     np.testing.assert_allclose(traj.energy, traj.energy[0], rtol=1e-11)
@@ -177,7 +178,9 @@ def test_the_poles_of_the_chart_are_reported_per_body():
     ],
 )
 def test_any_diffrax_solver_and_controller(solver):
-    """Adaptive, implicit, and constant steps, all handed over whole; constant ones backward."""
+    """Adaptive, implicit and constant steps, passed through unchanged; constant ones also backward
+    in time.
+    """
     constant = isinstance(solver, diffrax.Heun)
     ts = TS[::-1] if constant else TS
     controller = diffrax.ConstantStepSize() if constant else None
@@ -187,7 +190,7 @@ def test_any_diffrax_solver_and_controller(solver):
     assert float(jnp.max(rotation.angle_between(traj.wxyz, want.wxyz))) < 1e-5
 
 
-@pytest.mark.slow  # one body: above
+@pytest.mark.slow  # faster: one body, above
 def test_a_batch_by_a_solver_and_a_controller_of_diffrax():
     """16 heavy tops with steps of the user's controller: as accurate as its tolerance."""
     rng = np.random.default_rng(3)
@@ -208,7 +211,7 @@ def test_a_batch_by_a_solver_and_a_controller_of_diffrax():
     assert steps[0] < steps[1] / 3
 
 
-@pytest.mark.slow  # derivatives by states: tests/systems
+@pytest.mark.slow  # faster: derivatives with respect to states, tests/systems
 def test_forward_mode_and_times():
     """d/dt of the samples is the field; jvp by diffrax.ForwardMode, grad by the default."""
     forward = ph.LiePoisson(adjoint=diffrax.ForwardMode())
@@ -227,9 +230,9 @@ def test_forward_mode_and_times():
     np.testing.assert_allclose(back, want, atol=1e-9)
 
 
-@pytest.mark.slow  # derivatives by moments: tests/systems
+@pytest.mark.slow  # faster: derivatives with respect to moments, tests/systems
 def test_gradient_with_respect_to_the_initial_state():
-    """Time runs back: d(end)/d(start) times d(start)/d(end) is the identity."""
+    """Reversed time: d(end)/d(start) times d(start)/d(end) is the identity."""
     name = "free_short_axis_mode"
     system, exact = BY_NAME[name], truth(name)
     scene = free(jnp.array(system.moments))
@@ -305,7 +308,7 @@ FAST = ph.LiePoisson(max_steps=40, chunk=1)
 
 
 class Brake(eqx.Module):
-    """A torque against the rates, and a domain that a fast body leaves at once."""
+    """A torque against the rates, whose domain a fast body leaves at once."""
 
     gains: jax.Array
 
@@ -330,7 +333,7 @@ def energy_of(weight):
 
 @pytest.mark.slow
 def test_the_mean_over_the_bodies_that_finished_is_theirs_alone():
-    """With derivatives by shared parameters of the torque, and of the cost."""
+    """With derivatives with respect to shared parameters of the torque and of the cost."""
 
     def loss(gains, weight, sizes, **options):
         return ph.successful_mean(braked(gains, sizes, **options), energy_of(weight))

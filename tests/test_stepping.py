@@ -1,4 +1,4 @@
-"""What the planner steps: samples, failures, tolerances below rounding, gradients."""
+"""Integrated motions: samples, failures, tolerances below rounding, gradients."""
 
 import traceback
 from pathlib import Path
@@ -45,7 +45,7 @@ def test_the_field_of_a_heavy_top_stands_twelve_calls_below_simulate_at_most(mon
     monkeypatch.setattr(ph.UniformGravity, "height", watched)
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.25, 2.125]), GRAVITY)
     jax.make_jaxpr(lambda w: ph.simulate(scene, ph.State([1.0, 0, 0, 0], w), [0.0, 1.0]).wxyz)(
-        jnp.ones((13, 3))  # a batch that no other test has: not yet traced
+        jnp.ones((13, 3))  # a shape that no other test traces
     )
     depths = [1 + stack.index("lie_poisson_field") for stack in found]
     assert 3 < min(depths) <= 12, min(found, key=len)
@@ -53,7 +53,7 @@ def test_the_field_of_a_heavy_top_stands_twelve_calls_below_simulate_at_most(mon
 
 @pytest.mark.parametrize("sign", [pytest.param(1, marks=pytest.mark.slow), -1])
 def test_samples_at_uneven_times_are_as_exact_as_asked(sign):
-    """Many times within a step, many steps within an interval; also backwards."""
+    """Many times within a step, and many steps between two times; also backward."""
     ts = sign * np.concatenate([[0.0, 1e-6, 0.5, 0.5001], np.linspace(0.6, 4, 30), [20.0]])
     got = ph.simulate(SCENE, STATE, ts)
     method = ph.LiePoisson(diffrax.Dopri8())
@@ -66,7 +66,7 @@ def test_samples_at_uneven_times_are_as_exact_as_asked(sign):
 
 
 def test_a_tolerance_below_rounding_is_held_as_far_as_rounding_allows():
-    """Five thousand radians in float32: 1e-5 at the end would need steps exact to 2e-9."""
+    """Five thousand radians in float32: 1e-5 at the end would require steps accurate to 2e-9."""
     inertia = ph.Inertia.from_moments(np.array([1, 1.5, 2], np.float32))
     gravity = ph.UniformGravity(*(np.array(x, np.float32) for x in (1, [0, 0, 0.5], [0, 0, -1])))
     scene = ph.Scene(inertia, gravity, ph.LinearDamping(np.float32(1e-6)))
@@ -78,7 +78,7 @@ def test_a_tolerance_below_rounding_is_held_as_far_as_rounding_allows():
     double = jax.tree.map(lambda x: x.astype(float), (scene, state))
     best = ph.simulate(*double, np.array([0.0, 1000.0]))
     gap = rotation.angle_between(got.wxyz[-1].astype(float), best.wxyz[-1])
-    assert 1e-5 < float(gap) < 1e-2  # what it says, and not what was asked for
+    assert 1e-5 < float(gap) < 1e-2  # the stated error, not the requested one
     assert "about 1e-05 rad at every saved time" in str(ph.explain(scene, state, [0, 1]))
 
 
@@ -107,16 +107,16 @@ def test_a_torque_may_close_over_what_is_differentiated():
 
 
 def test_only_a_resting_centre_is_turned_upright():
-    """So that it lies on z."""
+    """Space axes are rotated so that the attracting centre is on z, if it does not move."""
     resting = ph.Scene(INERTIA, ph.GravityGradient(1.0, [1.0, 0, 0]))
     assert choose(resting)[0].chart.upright
     moving = ph.Scene(INERTIA, ph.GravityGradient(1.0, lambda t: jnp.stack([t, 1 + t, t])))
-    assert not choose(moving)[0].chart.upright  # the direction turns
+    assert not choose(moving)[0].chart.upright  # the direction rotates
 
 
 @pytest.mark.slow
 def test_a_gravity_gradient_is_the_same_seen_from_a_frame_upright_to_it():
-    """Slopes go through the turn."""
+    """Derivatives include that rotation."""
 
     def loss(place, mu, method):
         scene = ph.Scene(INERTIA, ph.GravityGradient(mu, place))
@@ -138,8 +138,9 @@ def test_a_gravity_gradient_is_the_same_seen_from_a_frame_upright_to_it():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["box", "bell"])
 def test_a_push_after_rest_or_on_a_turning_body_is_seen(kind):
-    """A torque that jumps beside the ends of a step is behind the estimate of the midpoint rule;
-    and before a bell-shaped one the body has next to no momentum to be exact to."""
+    """The estimate of the midpoint rule misses a torque that jumps near the ends of a step. Before
+    a bell-shaped torque the body has almost no momentum to which the error could be relative.
+    """
     state = ph.State([[1.0, 0, 0, 0]] * 2, [[0.0, 0, 0], [0.3, 0.1, -0.4]])
 
     def push(t):
@@ -162,7 +163,9 @@ def test_a_push_after_rest_or_on_a_turning_body_is_seen(kind):
     ids=["turning", "resting"],
 )
 def test_steps_go_on_from_a_jump_at_a_saved_time(rates, inclusive, ts):
-    """Steps of few units in the last place of the time grow again, or are cut until they pass."""
+    """Steps of a few units in the last place of the time must grow again, or shrink until they
+    pass.
+    """
 
     def push(t):
         acts = t >= 50 if inclusive else t > 50
@@ -178,7 +181,7 @@ def test_steps_go_on_from_a_jump_at_a_saved_time(rates, inclusive, ts):
 
 
 def test_a_brake_that_lets_go_at_a_rate():
-    """About one axis, with a constant torque down to a rate of 1/2: the angle is elementary."""
+    """About one axis, a constant torque down to a rate of 1/2: the angle is elementary."""
     rates = np.array([0.8, -1.5])
     state = ph.State([[1.0, 0, 0, 0], [0.6, 0, 0.8, 0]], rates[:, None] * [0, 0, 1.0])
 
@@ -196,7 +199,7 @@ def test_a_brake_that_lets_go_at_a_rate():
 
 
 def test_rounding_of_smooth_torques_in_single_precision_is_carried_along():
-    """Explicit steps, for want of that, had an error of 2e-3."""
+    """Without compensation of rounding, explicit steps had an error of 2e-3."""
 
     def found(dtype):
         arrays = ([1, 1.5, 2], [0, 0, 0.5], [1, 0, 0, 0], [0.3, 0.2, 2.0], [0, 100])
@@ -209,4 +212,4 @@ def test_rounding_of_smooth_torques_in_single_precision_is_carried_along():
     gap = rotation.angle_between(single.wxyz[-1].astype(float), exact.wxyz[-1])
     assert gap < 10 * 1e-5 + float(np.finfo(np.float32).eps) * 200**1.5  # of 200 rad
     explained = str(ph.explain(*found(np.float32)))
-    assert "extrapolated midpoint rule, its rounding carried along\n" in explained
+    assert "extrapolated midpoint rule, with compensated summation\n" in explained

@@ -1,4 +1,4 @@
-"""A trajectory at any time, its bodies and its samples: against SciPy and numerical differences."""
+"""A trajectory at any time, its bodies and samples, against SciPy and numerical differences."""
 
 import pickle
 
@@ -15,7 +15,7 @@ import polhode as ph
 MOMENTS = (1.0, 1.5, 2.0)
 STATE = ph.State([0.9, 0.1, 0.2, 0.3], [0.2, 0.1, 3.0])
 TS = jnp.linspace(0.0, 6.0, 13)
-ASKED = jnp.array([5.21, 0.0, 6.0, 3.123, 2.5, -0.7, 6.4])  # unsorted, saved ones, outside
+ASKED = jnp.array([5.21, 0.0, 6.0, 3.123, 2.5, -0.7, 6.4])  # unsorted, some saved, some outside
 CENTRE = (0.0, 0.1, 0.2)
 
 
@@ -34,7 +34,7 @@ SCENES = {
 
 
 def truth(name, times, rates=STATE.omega_body):
-    """Euler's equations written out by hand, and SciPy's DOP853 at 1e-13."""
+    """Euler's equations written by hand, solved by SciPy's DOP853 at 1e-13."""
     moments = np.array(MOMENTS)
     wheel = np.array([0.0, 0.05 * 4.0, 0.0]) if name == "wheel" else np.zeros(3)
 
@@ -52,7 +52,7 @@ def truth(name, times, rates=STATE.omega_body):
 
     times = np.asarray(times, float)
     found = {0.0: np.concatenate([STATE.wxyz, rates])}
-    for side in (times[times > 0], times[times < 0]):  # away from 0, from each to the next
+    for side in (times[times > 0], times[times < 0]):  # away from 0, from one to the next
         last = 0.0
         for t in sorted(side, key=abs):
             way = solve_ivp(field, (last, t), found[last], "DOP853", rtol=1e-13, atol=1e-13)
@@ -64,7 +64,7 @@ def truth(name, times, rates=STATE.omega_body):
     "name", ["free", *(pytest.param(x, marks=pytest.mark.slow) for x in ("pushed", "wheel"))]
 )
 def test_at_any_time(name):
-    """Within rtol where steps are taken, within rounding where the law is exact."""
+    """Within rtol for integrated motions, within rounding for closed forms."""
     traj = ph.simulate(SCENES[name], STATE, TS, rtol=1e-10)
     found = traj.at(ASKED)
     want = truth(name, ASKED)
@@ -74,7 +74,7 @@ def test_at_any_time(name):
     np.testing.assert_allclose(found.omega_body, want[:, 4:], rtol=0, atol=4 * tolerance)
     np.testing.assert_allclose(found.ts, ASKED)
     assert bool(found.successful)
-    saved = traj.state_at(2.5)  # a sample is met to rounding
+    saved = traj.state_at(2.5)  # reproduces the sample to rounding
     np.testing.assert_allclose(saved.omega_body, traj.omega_body[5], rtol=0, atol=2e-14)
     with_nan = traj.at(jnp.array([1.0, jnp.nan]))
     assert np.isfinite(with_nan.wxyz[0]).all()
@@ -106,7 +106,7 @@ def legs(scene):
     return jax.lax.scan(leg, STATE, None, length=2)[1]
 
 
-@pytest.mark.slow  # in loops of JAX; by units alone: tests/xla/test_single_call.py
+@pytest.mark.slow  # faster: tests/xla/test_single_call.py
 @pytest.mark.parametrize("rates", [between_samples, legs])
 def test_second_derivatives_in_loops(rates):
     def total(moments):
@@ -120,10 +120,12 @@ def test_second_derivatives_in_loops(rates):
     np.testing.assert_allclose(found, want, rtol=0, atol=1e-6 * np.abs(want).max())
 
 
-@pytest.mark.slow  # derivatives at saved times: tests/systems
+@pytest.mark.slow  # faster: derivatives at saved times, tests/systems
 @pytest.mark.parametrize("name", ["free", "top"])
 def test_derivatives_of_a_motion_at_a_time(name):
-    """In time, initial rates and moments: SciPy's, and differences of SciPy's motion."""
+    """With respect to time, initial rates and moments: SciPy's rates, and differences of SciPy's
+    motion.
+    """
     potential = SCENES[name].potential
 
     @jax.jit
@@ -179,7 +181,7 @@ def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
     assert batch.last.wheel_speed is None
     np.testing.assert_array_equal(batch.last.wxyz, batch.wxyz[..., -1, :])
     np.testing.assert_array_equal(batch.last.omega_body, batch.omega_body[..., -1, :])
-    # each moves on by its own numbers
+    # each body continues with its own numbers
     np.testing.assert_allclose(one.at(ASKED).wxyz, batch.at(ASKED).wxyz[1, 2], atol=1e-11)
     own = jnp.broadcast_to(ASKED, (2, 3, ASKED.size)) + 0.1 * jnp.arange(3.0)[None, :, None]
     np.testing.assert_allclose(batch.at(own).wxyz[1, 2], one.at(ASKED + 0.2).wxyz, atol=1e-11)
@@ -208,7 +210,7 @@ def test_what_no_sample_has_is_refused(batch):
 
 @pytest.mark.slow
 def test_a_trajectory_is_data_everywhere():
-    """Out of jit and vmap, pickled, and put together again it still moves."""
+    """After jit, vmap, pickling and reassembly it can still be evaluated at any time."""
     scene = SCENES["top"]
 
     def moved(omega):
@@ -237,7 +239,7 @@ def test_euler_angles_of_any_sequence_are_those_of_scipy():
 
 
 def test_a_printed_trajectory_shows_size_status_and_steps():
-    """Of a batch how many bodies have each status, and the range of their steps."""
+    """For a batch: how many bodies have each status, and the range of their steps."""
     body = ph.Inertia.from_moments([1.0, 1.5, 2.0])
     free = ph.simulate(ph.Scene(body), ph.State([1.0, 0, 0, 0], [0.3, 0.2, 1.0]), [0.0, 2.5])
     assert str(free).split("\n") == [
@@ -263,10 +265,11 @@ TURNED_BODY = ph.Inertia.from_moments([2.0, 2.0, 2.0])
 
 
 def test_steps_that_end_at_switches_and_events_are_counted():
-    """And printed where there are any.
+    """The counts are printed if they are not zero.
 
-    The number of sign changes is known: a torque of constant size about one axis, directed against
-    the turn by the angle so far, swings the body to and fro."""
+    The number of sign changes is known: a torque of constant size about one axis, opposite to the
+    angle so far, makes the body oscillate.
+    """
 
     def against(t, wxyz, omega):
         return jnp.array([0.0, 0.0, jnp.where(wxyz[0] * wxyz[3] > 0, -1.0, 1.0)])
@@ -298,7 +301,7 @@ def test_steps_limited_by_stability_are_counted():
     assert f"limited by stability: {int(fast.step_counts.at_stability):,}" in str(fast)
 
 
-@pytest.mark.slow  # the other counts: above
+@pytest.mark.slow  # faster: the other counts, above
 def test_steps_that_end_at_saved_times_or_are_refused_are_counted():
     gravity = ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -9.81])
     top = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), gravity)
@@ -306,7 +309,7 @@ def test_steps_that_end_at_saved_times_or_are_refused_are_counted():
     often = ph.simulate(top, states, np.linspace(0.0, 2.0, 401))
     np.testing.assert_array_equal(often.step_counts.at_times, 400)
     seldom = ph.simulate(top, states, [0.0, 20.0])
-    assert np.all(seldom.step_counts.at_times <= 3)  # the last one, and those halved before it
+    assert np.all(seldom.step_counts.at_times <= 3)  # the last step, and halved steps before it
     assert "ended at a saved time: 400" in str(often)
     assert often[3].step_counts.at_times == 400
     ends = often.at([1.001, 1.0])

@@ -1,4 +1,4 @@
-"""Type-check what users write: ``python tests/user_types.py`` runs mypy and pyright on examples.
+"""Type-check user code: ``python tests/user_types.py`` runs mypy and pyright on the examples.
 
 The examples are the Python blocks of README.md and of every page of docs/, each page one module.
 Both checkers must accept them, and must reject a misspelt name.

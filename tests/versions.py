@@ -1,14 +1,14 @@
-"""``make test-versions``: smoke.py on the lowest and the newest versions of what polhode needs.
+"""``make test-versions``: run smoke.py with the lowest and the newest versions of the dependencies.
 
-Each set has an environment of its own beside the checkout, ``.venv-lowest`` and ``.venv-newest``,
-made with the interpreter that runs this file (JAX from 0.11 on needs Python 3.12) and holding every
-extra; name one set to run it alone. The lowest set is read from pyproject.toml.
+Each set has its own environment in the checkout, ``.venv-lowest`` and ``.venv-newest``, created
+with the interpreter that runs this file (JAX 0.11 and newer need Python 3.12) and including every
+extra; the name of a set runs it alone. The lowest set is read from pyproject.toml.
 
-``python tests/versions.py next`` installs the newest JAX that exists, beyond the upper bound. With
-fused kernels requested it runs smoke.py, the functions that XLA folds away, and the tests that
-depend on JAX's own operations: kernels and switches of programs. Where they pass, add the version
-to ``FUSED_JAXLIB`` in ``src/polhode/_policy.py``, which is the table of versions on which fused
-kernels are used, raise the bound, and run all tests.
+``python tests/versions.py next`` installs the newest JAX, beyond the upper bound. With fused
+kernels enabled it runs smoke.py, the functions that XLA simplifies to constants, and the tests that
+depend on JAX's own operations: kernels and switches of programs. If they pass, add the version to
+``FUSED_JAXLIB`` in ``src/polhode/_policy.py``, the table of versions with which fused kernels are
+used, raise the bound, and run all tests.
 """
 
 import os
@@ -26,7 +26,7 @@ OF_OPERATIONS = ("tests/xla", "tests/solvers/test_switches.py")
 
 
 def floors() -> list[str]:
-    """``name==version`` of the dependencies and of those of every extra, at the floors."""
+    """``name==version`` of the dependencies and of those of every extra, at their lower bounds."""
     project = PROJECT["project"]
     needs = {*project["dependencies"]}.union(*project["optional-dependencies"].values())
     needs = sorted(need for need in needs if not need.startswith("polhode["))

@@ -1,6 +1,6 @@
 """Words that names and docstrings of polhode avoid: ``python tests/vocabulary.py`` lists them.
 
-The glossary (docs/glossary.md) has the terms to use in their place.
+The glossary (docs/glossary.md) contains the terms to use instead.
 """
 
 import inspect
@@ -91,7 +91,7 @@ def described() -> Iterator[tuple[str, object]]:
 
 
 def retired_words(text: str) -> list[str]:
-    """Retired words of a docstring, code left out."""
+    """Retired words in a docstring, ignoring code."""
     prose = re.sub(r"``.*?``|^ {4,}\S.*$", " ", text, flags=re.MULTILINE)
     return [match[0].lower() for match in PATTERN.finditer(prose)]
 
@@ -105,7 +105,7 @@ def names_of(full: str, thing) -> Iterator[str]:
 
 
 def violations() -> tuple[dict[str, list[str]], set[str]]:
-    """Docstrings with retired words, and public names that are bare."""
+    """Docstrings with retired words, and public names in ``BARE``."""
     words = {}
     bare = set()
     for full, thing in described():

@@ -1,11 +1,11 @@
-"""The other programs of the comparison: one module each, same inputs, own code.
+"""The compared programs: one module each, with the same inputs and independent code.
 
 A module has ``NAME``, ``PACKAGES`` (distributions whose versions are recorded) and
 
     programs(problem, n, dtype, tolerances, quick) -> list[Program]
 
-which is empty where it has nothing to offer for the problem. Whatever compiles is compiled there,
-apart from the run.
+which is empty if the program does not support the problem. Compilation happens there, not in the
+timed call.
 """
 
 import importlib
@@ -25,12 +25,13 @@ MODULES = (
 
 
 class Program(NamedTuple):
-    """A way to move the bodies of a problem.
+    """A method of one program that simulates the bodies of a problem.
 
-    ``label``: what it is; ``setting``: tolerance or steps; ``call()``: (wxyz, omega) at the saved
-    times, (bodies, saves, 4) and (bodies, saves, 3), done when it returns; ``bodies``: how many
-    bodies a call moves (the first of the problem: less than asked for where the cost per body does
-    not depend on their number); ``compile_s``: seconds to compile; None: nothing is compiled.
+    ``label``: name; ``setting``: tolerance or number of steps; ``call()``: (wxyz, omega) at the
+    saved times, (bodies, saves, 4) and (bodies, saves, 3), blocking until they are computed;
+    ``bodies``: the number of bodies of a call (the first of the problem; fewer than requested if
+    the cost per body does not depend on their number); ``compile_s``: seconds to compile, None if
+    nothing is compiled.
     """
 
     label: str
@@ -41,7 +42,7 @@ class Program(NamedTuple):
 
 
 def load() -> tuple[dict, dict[str, str]]:
-    """Modules of the peers that are installed, and why the others are missing."""
+    """Modules of the programs that are installed, and why the others are missing."""
     found, missing = {}, {}
     for name in MODULES:
         try:
@@ -54,9 +55,9 @@ def load() -> tuple[dict, dict[str, str]]:
 
 
 def rigid_body(problem, q, w, sums):
-    """Rates of (wxyz, omega) of a problem from components: plain arithmetic for any peer.
+    """Rates of (wxyz, omega) of a problem by components, in plain arithmetic for any program.
 
-    ``sums``: unused zero of the peer's kind of number, so that constant rates keep that kind.
+    ``sums``: a zero of the program's number type, so that constant rates have this type too.
     """
     q0, q1, q2, q3 = q
     x, y, z = w
@@ -78,7 +79,7 @@ def rigid_body(problem, q, w, sums):
     if problem.gradient:
         from benchmarks.problems import DIRECTION
 
-        u, _, v = DIRECTION  # seen from the body; lies in the xz plane of space
+        u, _, v = DIRECTION  # in the xz plane of space; n: its components in the body
         n = (
             u * (q0 * q0 + q1 * q1 - q2 * q2 - q3 * q3) + 2 * v * (q1 * q3 - q0 * q2),
             2 * u * (q1 * q2 - q0 * q3) + 2 * v * (q2 * q3 + q0 * q1),

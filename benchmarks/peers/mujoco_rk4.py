@@ -1,4 +1,4 @@
-"""MuJoCo's RK4 in equal steps, one body after the other (its other integrators are of order 1)."""
+"""MuJoCo's RK4 with constant steps, one body after another (its other integrators have order 1)."""
 
 import mujoco
 import numpy as np
@@ -40,7 +40,7 @@ def _run(problem, wxyz, omega, steps):
 
 
 def _model(problem, step):
-    """A free body, or a top on a ball joint of mass 1 whose centre is half a metre up body z."""
+    """A free body, or a top of mass 1 on a ball joint with its centre of mass 0.5 m up body z."""
     a, b, c = problem.moments
     joint, centre, gravity = "<freejoint/>", 0.0, 0.0
     if problem.weight:

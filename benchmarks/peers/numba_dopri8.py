@@ -1,4 +1,4 @@
-"""Hand-written loops compiled by Numba: Dormand-Prince 8(7) with its own steps for every body."""
+"""Hand-written loops compiled by Numba: Dormand-Prince 8(7), adaptive steps for each body."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""polhode itself: what the planner chooses, and LiePoisson where it would choose something else."""
+"""polhode: the default method, and LiePoisson where the default is a different method."""
 
 import time
 
@@ -71,12 +71,12 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
 
 
 def _named(method) -> str:
-    """By its solver where it steps."""
+    """Label of a method: its solver if it integrates."""
     return type(getattr(method, "solver", method)).__name__
 
 
 def _compiled(method, given, start, ts, record):
-    """What ``jax.jit`` of a call of ``ph.simulate`` gives, compiled."""
+    """The compiled program of ``jax.jit`` of a call of ``ph.simulate``."""
 
     @jax.jit
     def simulated(wxyz, omega, rtol):

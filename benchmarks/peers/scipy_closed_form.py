@@ -38,14 +38,14 @@ def closed_form(moments, q, w, t):
     size = np.linalg.norm(momentum, axis=1)
     low, middle, high = np.argsort(moments)
     above = np.sum(momentum**2, 1) > np.sum(momentum * w, 1) * moments[middle]
-    c = np.where(above, high, low)  # the axis that the momentum circles
+    c = np.where(above, high, low)  # the axis about which the momentum circulates
     a, b = np.where(above, low, high), np.full(n, middle)
     body = np.arange(n)
     hand = np.where((b - a) % 3 == 1, 1.0, -1.0)
     wa, wb, wc = w[body, a], hand * w[body, b], w[body, c]
     A, B, C = moments[a], moments[b], moments[c]
 
-    # L^2 - 2 T C and L^2 - 2 T A as sums of one sign
+    # L^2 - 2 T C and L^2 - 2 T A as sums of terms with one sign
     excess = A * (A - C) * wa**2 + B * (B - C) * wb**2
     other = B * (B - A) * wb**2 + C * (C - A) * wc**2
     top = [np.sqrt(excess / (A * (A - C))), np.sqrt(excess / (B * (B - C)))]

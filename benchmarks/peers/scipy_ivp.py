@@ -1,4 +1,4 @@
-"""SciPy's solve_ivp: one body after the other, and all bodies as one system."""
+"""SciPy's solve_ivp: one body after another, and all bodies as one system."""
 
 import numpy as np
 from scipy.integrate import solve_ivp

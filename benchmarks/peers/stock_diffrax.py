@@ -1,7 +1,7 @@
 """diffrax as its documentation shows it: quaternion and rates, or Euler angles by jax.grad of H.
 
-Three layouts: ``vmap`` of a solve per body (each with its own steps, in lock step), one solve of a
-chunk of bodies as an array (7, 40), and one body alone.
+Three layouts: ``vmap`` of a solve for each body (each with its own steps, all running until the
+last finishes), one solve of a chunk of bodies as an array (7, 40), and one body alone.
 """
 
 import time
@@ -23,7 +23,7 @@ STEPS = 2**20
 
 def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
     if problem.horizon > 1e4:
-        return []  # hours
+        return []  # would take hours
     wxyz, omega = problem.states(n)
     start = np.concatenate([wxyz, omega], axis=1).astype(dtype)
     times = jnp.asarray(problem.times, dtype)

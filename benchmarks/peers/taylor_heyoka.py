@@ -1,4 +1,4 @@
-"""heyoka's adaptive Taylor integrator: one body, or as many at once as the vector unit holds."""
+"""heyoka's adaptive Taylor integrator: one body, or one body per lane of the vector unit."""
 
 import time
 
@@ -15,7 +15,7 @@ PACKAGES = ("heyoka",)
 def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
     if dtype != np.float64:
         return []
-    if problem.horizon > 1e4:  # seconds a body: the first alone, at two tolerances
+    if problem.horizon > 1e4:  # seconds per body: only the first body, at two tolerances
         tolerances, n = (tolerances[-1:] if quick else (1e-9, 1e-15)), 1
     else:
         tolerances = [*(t for t in tolerances if t > 1e-14), 1e-15]

@@ -1,9 +1,9 @@
 """Inertia from throws of bodies with a gyroscope and a reaction wheel (TU Delft, arXiv:2503.13137).
 
-An estimator for one laboratory's recordings, by maximum likelihood of the readings. It takes
-``Recording``, ``stack``, ``averaged``, ``SteppedMotion`` and ``FitError`` of the public
-``polhode.fit``; the likelihood, its search and its result are its own.
-``python -m benchmarks.throws`` applies it to the recordings.
+A maximum-likelihood estimator for the recordings of one laboratory. It uses ``Recording``,
+``stack``, ``averaged``, ``SteppedMotion`` and ``FitError`` of the public module ``polhode.fit``;
+the likelihood, its optimiser and its result are implemented here. ``python -m benchmarks.throws``
+applies it to the recordings.
 """
 
 from benchmarks.throws.design import throw_information as throw_information

@@ -1,23 +1,24 @@
-"""Inertia of thrown objects from 55 real throws with a flywheel, and the recipe that finds it.
+"""Inertia of thrown objects from 55 real throws with a flywheel.
 
 Recordings: TU Delft (arXiv:2503.13137), a device with gyroscope, accelerometer and wheel, thrown
-alone, on a proof body of known inertia, and on objects in four configurations. Not shipped with the
-project; expected in ``../shared/data/tudelft_throws`` or given by ``--data``. The recipe uses no
-reference value of an object:
+alone, on a proof body of known inertia, and on objects in four configurations. Not part of the
+project; expected in ``../shared/data/tudelft_throws`` or the folder ``--data``. The procedure uses
+no reference value of an object:
 
-1. free flight only, from 80 ms after the wheel's start; speeds of the wheel read just after its
-   motor was switched are left out;
-2. one ``fit_balance`` of all throws: six tensors, and how the instrument departs from ideal;
+1. only free flight, from 80 ms after the wheel's start, without the speeds of the wheel just after
+   its motor was switched;
+2. one ``fit_balance`` of all throws: six tensors, and the deviations of the instrument from ideal;
 3. centres of mass by ``lever_arm``;
 4. the spin inertia of the wheel from the proof body: all moments are proportional to it;
-5. the object: what was measured less the device (``MassProperties`` know the parallel axes).
+5. the object: the measured body minus the device (``MassProperties``, parallel-axis theorem).
 
-Writes tensors of every throw and of every configuration, and their errors where a reference is in
-the data: |moments - reference| / |reference|, and the smallest turn between principal axes.
+The output contains the tensors of every throw and of every configuration, and their errors if the
+data contain a reference: |moments - reference| / |reference|, and the smallest rotation between the
+principal axes.
 
     python -m benchmarks.throws [--varied] [--data FOLDER] [--output out/benchmarks/throws.json]
 
-``--varied``: the joint fit again under other choices of the recipe as well (some minutes more).
+``--varied``: also repeat the joint fit with other choices in the procedure (some minutes more).
 """
 
 import json
@@ -40,14 +41,14 @@ from polhode.rotation import wxyz_to_matrix
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "tudelft_throws"
 DEVICE, PROOF = "device_only", "proof_body"
-# kg m^2, of the wheel: where the balance begins; the proof body corrects it
+# spin inertia of the wheel [kg m^2], a starting value that the proof body corrects
 SPIN = 1.7e-6
-# samples averaged first, and samples of those to a residual
+# samples that are averaged, and averaged samples per residual
 FAST, BLOCK = 4, 4
 
 
-# What a choice of the recipe might change: window of the flight, s; how much more is left out where
-# the motor was switched, s; samples to a residual
+# Varied choices: window of the flight [s]; additional margin around each switching of the motor
+# [s]; samples per residual
 VARIED = {
     "flight from 0.10 to 0.52 s": {"flight": (0.10, 0.52)},
     "10 ms more left out at each switch": {"margin": 0.01},
@@ -56,7 +57,7 @@ VARIED = {
 
 
 def load(folder, configurations=None, **how):
-    """Index and recordings by configuration; ``how``: for ``recording``."""
+    """Index, and recordings by configuration; ``how``: options of ``recording``."""
     index = json.loads((folder / "index.json").read_text())
     arrays = np.load(folder / "throws.npz")
     found = {}
@@ -69,7 +70,7 @@ def load(folder, configurations=None, **how):
 
 
 def recording(table, flight=(0.08, 0.56), margin=0.0):
-    """Free flight of one throw. Columns: time, rates, wheel, force."""
+    """The free flight of one throw. Columns: time, rates, wheel, force."""
     times, wheel = table[:, 0], table[:, 4].copy()
     up = times[np.argmax((times > 0.1) & (wheel < -400))]
     down = times[np.argmax((times > 0.3) & (wheel > -900))]
@@ -94,12 +95,12 @@ def together(found, block=BLOCK):
 
 
 def varied(folder, usual, single):
-    """What other choices do to the joint fit ``usual`` and to its single throws, by configuration.
+    """Effect of other choices on the joint fit ``usual`` and on single throws, by configuration.
 
-    Moves of the joint moments over their standard deviation, and over the one that leaving readings
-    out makes of it (variances of nested estimates subtract, where they do); moves of the means of
-    single throws over the standard deviation of these means, and over that which the moves of the
-    throws themselves show.
+    Changes of the joint moments are divided by their standard deviation, and by the change expected
+    from omitted readings (the square root of the difference of the variances, if it is positive).
+    Changes of the means of single throws are divided by the standard deviation of these means, and
+    by that which follows from the scatter of the changes of single throws.
     """
     table = {}
     first, spread = np.asarray(usual.moments), np.asarray(usual.moments_std)
@@ -141,8 +142,11 @@ def varied(folder, usual, single):
 
 
 def agreement(joint, single, body):
-    """Means of single throws less the joint fit, %, and over what the errors stated make of it;
-    plain means, and weighed by the errors stated."""
+    """Means of single throws minus the joint fit, in per cent and divided by the expected
+    deviation.
+
+    Both for plain means and for means weighted by the stated errors.
+    """
     moments, spread = np.asarray(joint.moments)[body], np.asarray(joint.moments_std)[body]
     each, own = np.asarray(single.moments), np.asarray(single.moments_std)
     apart = each.mean(axis=0) - moments
@@ -175,12 +179,12 @@ def measure(found):
 
 
 def body(mass, arm, tensor):
-    """Mass properties about the sensor: ``arm`` leads from the centre of mass to it."""
+    """Mass properties about the sensor; ``arm``: its position relative to the centre of mass."""
     return MassProperties.of(mass, -np.asarray(arm), ph.Inertia(full=tensor))
 
 
 def objects(index, joint, tensors, arms):
-    """Tensors of the objects, the scale set by the proof body; ``joint``, ``tensors`` by name."""
+    """Tensors of the objects, scaled by the proof body; ``joint``, ``tensors``: by name."""
     light, proof = index["m_dev_kg"], index["proof_body"]
 
     def device(scale):
@@ -190,7 +194,7 @@ def objects(index, joint, tensors, arms):
         whole = body(mass + light, arms[name], scale * tensor)
         return np.asarray((whole - device(scale)).inertia.tensor)
 
-    # traces know nothing of axes, and are linear in the scale
+    # traces do not depend on the axes, and are linear in the scale
     at = [np.trace(less(PROOF, proof["mass_kg"], joint[PROOF], scale)) for scale in (0.9, 1.1)]
     known = np.trace(np.array(proof["I_kgm2"]))
     scale = 0.9 + 0.2 * (known - at[0]) / (at[1] - at[0])
@@ -203,12 +207,14 @@ def objects(index, joint, tensors, arms):
 
 
 def turn_of(tensor, reference):
-    """Smallest turn (3,), degrees, sensor axes, from the reference to the principal axes found."""
+    """Smallest rotation (3,) [degrees, sensor axes] from the reference to the estimated principal
+    axes.
+    """
     frames = []
     for given in (reference, tensor):
         _, turn = ph.Inertia(full=given).to_principal()
         frames.append(np.asarray(wxyz_to_matrix(turn)))
-    # half turns about principal axes change nothing
+    # half turns about principal axes do not change the tensor
     signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     signs = signs[np.argmax(signs @ np.diagonal(frames[0].T @ frames[1]))]
     matrix = frames[1] @ np.diag(signs) @ frames[0].T
@@ -218,14 +224,14 @@ def turn_of(tensor, reference):
 
 
 def errors(tensor, reference):
-    """Relative error of the moments, %, and turn of the axes, degrees."""
+    """Relative error of the moments [%], and rotation of the axes [degrees]."""
     found, true = (np.linalg.eigvalsh(one) for one in (tensor, reference))
     apart = np.linalg.norm(found - true) / np.linalg.norm(true)
     return 100 * float(apart), float(np.linalg.norm(turn_of(tensor, reference)))
 
 
 def tables(index, made):
-    """Estimates of every configuration and their errors where the reference is known."""
+    """Estimates of every configuration, and errors where the reference is known."""
     found = {}
     for name, tensors in made.items():
         row = {
@@ -246,7 +252,7 @@ def tables(index, made):
 
 
 def run(folder, configurations=None, vary=False):
-    """The whole recipe."""
+    """The complete procedure."""
     index, found = load(folder, configurations)
     fit, each, arms = measure(found)
     joint = dict(zip(found, np.asarray(fit.inertia.tensor), strict=True))

@@ -10,7 +10,7 @@ from benchmarks.throws.likelihood import Noise, Readings, innovations, score_of
 from benchmarks.throws.numerics import entries_of, symmetric_matrix
 from polhode.fit import SteppedMotion
 
-# spin that drag may take in a second, as a part of the whole, of which the throw tells the rest
+# prior standard deviation of the relative loss of spin by drag in a second
 _LOST = 0.3
 
 
@@ -23,12 +23,12 @@ def throw_information(
     noise: Noise,
     block: int = 1,
 ) -> Float[Array, "6 6"]:
-    """Fisher information about the tensor from one planned throw, as ``fit_balance`` uses it.
+    """Fisher information about the tensor from one planned throw, for the model of ``fit_balance``.
 
-    **Arguments:** ``tensor`` (3, 3), kg m^2, sensor axes, the wheel locked; ``omega`` (3,), rad/s:
-    rates at ``times[0]``; ``wheel_speed`` (T,), rad/s, at ``times`` (T,), s; ``instrument``
-    (its axis must not be traced); ``noise`` of one body, of residuals of ``block`` samples, such as
-    ``Fit.noise_levels``. The throw is simulated without drag, with drag among the unknowns.
+    **Arguments:** ``tensor`` (3, 3), kg m^2, sensor axes, with the wheel locked; ``omega`` (3,),
+    rad/s: rates at ``times[0]``; ``wheel_speed`` (T,), rad/s, at ``times`` (T,), s; ``instrument``
+    (its axis must not be traced); ``noise`` of one body, for residuals of ``block`` samples, such
+    as ``Fit.noise_levels``. The throw is simulated without drag, but drag is one of the unknowns.
 
     Returns the information (6, 6) about xx, yy, zz, yz, zx, xy over half the trace of the tensor:
     its inverse is the Cramer-Rao bound of their relative errors. Its log-determinant is
@@ -57,7 +57,7 @@ def throw_information(
     def found(unknown):
         drag = _LOST * size * jnp.stack([unknown[6], unknown[7] / typical])
         body = symmetric_matrix(unknown[:6])
-        # as in the fit: torques are as uncertain as the body is large
+        # as in the fit: torques scale with the body
         shaken = noise.grown(jnp.trace(body) / 2)
         got = innovations(data, size * body, drag, instrument, shaken)
         return got, got

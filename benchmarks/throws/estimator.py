@@ -1,4 +1,4 @@
-"""``fit_balance``: inertia from throws in air, in absolute size with a reaction wheel aboard."""
+"""``fit_balance``: inertia from throws in air, with a reaction wheel in absolute size."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,21 +17,22 @@ from benchmarks.throws.scoring import Known, solve_balance, start_of
 from polhode.fit import FitError, Recording, stack
 from polhode.inertia import Inertia, principal
 
-# a third less time to compile
+# compiles in two thirds of the time
 _OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
 
 
 class ThrowFit(eqx.Module):
-    """Inertia, drag, instrument and noise by maximum likelihood; leading axis n: the bodies.
+    """Inertia, drag, instrument and noise by maximum likelihood; the leading axis n: bodies.
 
-    **Fields:** ``inertia`` (without a wheel its largest moment is 1), ``moments``, ``axes``,
-    ``ratios`` and their standard deviations as of ``polhode.fit.Fit``; ``drag`` (n, 2): linear and
-    quadratic; ``covariance`` (n, 8, 8) of the entries xx, yy, zz, yz, zx, xy and ``drag``;
-    ``residuals``: ``"omega"`` (n, m, b, 3) over their standard deviations ``"omega_std"``, rad/s;
-    ``whiteness`` (n,): probability of autocorrelations as large as theirs; ``instrument``, as
-    estimated where a ``tolerance`` was given; ``noise_levels``: standard deviations of readings and
-    disturbing torques; ``negative_log_likelihood`` (n,): of all readings together, up to a
-    constant; ``steps``, ``converged`` (n,): of the optimiser; ``scale_known``, ``block``.
+    **Fields:** ``inertia`` (without a wheel scaled to a largest moment of 1), ``moments``,
+    ``axes``, ``ratios`` and their standard deviations, as in ``polhode.fit.Fit``; ``drag`` (n, 2):
+    linear and quadratic; ``covariance`` (n, 8, 8) of the entries xx, yy, zz, yz, zx, xy and
+    ``drag``; ``residuals``: ``"omega"`` (n, m, b, 3) over their standard deviations
+    ``"omega_std"``, rad/s; ``whiteness`` (n,): probability of autocorrelations of at least this
+    size; ``instrument``: estimated if a ``tolerance`` was passed; ``noise_levels``: standard
+    deviations of readings and disturbing torques; ``negative_log_likelihood`` (n,): of all readings
+    together, up to a constant; ``steps``, ``converged`` (n,): of the optimiser; ``scale_known``,
+    ``block``.
     """
 
     inertia: Inertia
@@ -54,7 +55,7 @@ class ThrowFit(eqx.Module):
 
     @property
     def is_usable(self) -> bool:
-        """Whether the search for every body converged to finite numbers."""
+        """Whether the optimiser converged to finite numbers for every body."""
         finite = np.isfinite(self.inertia.tensor).all() and np.isfinite(self.covariance).all()
         return bool(np.all(self.converged) and finite)
 
@@ -70,27 +71,27 @@ def fit_balance(
 ) -> ThrowFit:
     """Inertia tensors of thrown bodies by maximum likelihood of the readings of a gyroscope.
 
-    For throws in air, with a reaction wheel of measured speed or without one (``Instrument(None)``:
-    then the ratios of the moments show, not their size). The gyroscope turns the frame in which the
-    momentum ``I omega + h`` is followed by a Kalman filter; drag, white torques and a torque with
-    memory change it, with levels that are estimated. The rates read are compared with those
-    expected: their noise does not bias the moments, not even of a single short throw that hardly
-    shows them.
+    For throws in air with a reaction wheel whose speed is measured, or without one
+    (``Instrument(None)``, which determines the ratios of the moments only). The readings of the
+    gyroscope define a rotating frame, in which a Kalman filter propagates the momentum ``I omega +
+    h`` with drag, white torques and a torque with a correlation time, whose levels are estimated.
+    The filter compares measured with predicted rates; therefore their noise does not bias the
+    moments, even for a single short throw with little information.
 
     **Arguments:**
 
     - ``recordings``: with rates and, for a wheel, ``wheel_speed``, of free flight only; NaN where a
       reading is doubtful, such as the speed of a motor that was just switched on.
-    - ``instrument``: as in its data sheet; ``tolerance``: standard deviations of it, with which it
-      is fitted to all recordings together (None: it is taken as given).
-    - ``bodies``: number of the body that each recording shows, from 0 on (None: one body).
-    - ``block``: how many samples give one residual: so many that their noise is white. Readings
-      much faster than the motion are best ``averaged`` first.
+    - ``instrument``: according to its data sheet; ``tolerance``: standard deviations of its fields,
+      with which they are fitted to all recordings together (None: the instrument is exact).
+    - ``bodies``: number of the body in each recording, from 0 (None: one body).
+    - ``block``: number of samples per residual, large enough that the noise of residuals is white.
+      Apply ``averaged`` first to readings that are much faster than the motion.
     - ``throw``: whether a fit that is not finite or did not converge raises FitError.
 
-    Returns a ``ThrowFit`` whose leading axis n are the bodies. A body with fewer recordings than
-    another has zeros as residuals and initial rates of those that it lacks. Every tensor is
-    physical.
+    Returns a ``ThrowFit`` whose leading axis n is that of the bodies. A body with fewer recordings
+    than another has zeros as residuals and initial rates in place of the missing ones. Every tensor
+    is physical.
 
     Raises ValueError for recordings without rates or the wheel's speed, and FitError.
     """
@@ -135,10 +136,10 @@ def _require(condition: bool, message: str) -> None:
 
 
 def fit_each(fit: ThrowFit, recordings: Sequence[Recording], body: int = 0) -> ThrowFit:
-    """Every recording of a body by itself, with the instrument and the noise of a joint fit.
+    """Fits of single recordings of a body, with the instrument and the noise of a joint fit.
 
-    **Arguments:** ``fit``: of ``fit_balance``; ``recordings`` of one of its bodies, ``body``.
-    Returns a ``ThrowFit`` whose leading axis are the recordings.
+    **Arguments:** ``fit``: a result of ``fit_balance``; ``recordings`` of one of its bodies,
+    ``body``. Returns a ``ThrowFit`` whose leading axis is that of the recordings.
     """
     instrument, noise, tensor = jax.tree.map(
         lambda x: x[body], (fit.instrument, fit.noise_levels, fit.inertia.tensor)
@@ -152,7 +153,7 @@ def fit_each(fit: ThrowFit, recordings: Sequence[Recording], body: int = 0) -> T
 
 
 def _by_body(numbers: np.ndarray, count: int) -> tuple[Array, Array]:
-    """Places (n, m) of the recordings of each body among all, and 1 where there is one, else 0."""
+    """Indices (n, m) of the recordings of each body, and a mask of 1 and 0 for padding."""
     each = [np.flatnonzero(numbers == k) for k in range(count)]
     most = max(map(len, each))
     places, used = np.zeros((count, most), int), np.zeros((count, most))
@@ -181,7 +182,7 @@ def _alone(recording, instrument, noise, tensor, block) -> ThrowFit:
 
 
 def _fit_of(found, places: Array, used: Array, block: int) -> ThrowFit:
-    """Uncertainty of every body, its recordings at ``places`` (n, m)."""
+    """Result of every body with its uncertainty, for its recordings at ``places`` (n, m)."""
     sized = found.instrument.spin_inertia is not None
     dtype = found.tensors.dtype
     used = used.astype(dtype)
@@ -194,7 +195,7 @@ def _fit_of(found, places: Array, used: Array, block: int) -> ThrowFit:
             unit = jnp.ones_like(values[2]) if sized else values[2]
             return jnp.concatenate([values / unit, vector / unit, values / values[2]])
 
-        # moments, entries and drag, ratios begin at 0, 3, 11
+        # offsets: moments 0, entries and drag 3, ratios 11
         slope = jax.jacfwd(derived)(jnp.concatenate([entries_of(tensor), drag]))
         covariance = slope @ covariance @ slope.T
         std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
@@ -207,7 +208,7 @@ def _fit_of(found, places: Array, used: Array, block: int) -> ThrowFit:
             moments=moments,
             axes=axes,
             ratios=moments / moments[2],
-            # without a wheel the data do not show the size
+            # without a wheel the size is not determined
             moments_std=std[:3] if sized else jnp.full_like(std[:3], jnp.inf),
             ratios_std=std[11:].at[2].set(0),
             drag=drag / size,
@@ -223,7 +224,7 @@ def _fit_of(found, places: Array, used: Array, block: int) -> ThrowFit:
             block=block,
         )
 
-    # those that all bodies share as well
+    # also the unknowns that all bodies share
     count = used.shape[0]
     shared = (jnp.broadcast_to(x, (count,)) for x in found.noise[5:])
     levels = Noise(*found.noise[:5], *shared)

@@ -1,4 +1,4 @@
-"""A gyroscope beside a reaction wheel: calibration parameters, and preparation of recordings."""
+"""A gyroscope and a reaction wheel: calibration parameters, and preparation of recordings."""
 
 from typing import Any, NamedTuple
 
@@ -19,11 +19,11 @@ def _as_floats(value: Any) -> Any:
 class Instrument(eqx.Module):
     """Calibration of gyroscope and reaction wheel: ``omega = (1 + skew) (reading - bias)``.
 
-    **Fields:** ``spin_inertia``, kg m^2, of the wheel (None: there is none); ``axis`` (3,) unit
-    vector of its axis in sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of
-    ``delay`` before; ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity
-    from one (a common factor is that of ``spin_inertia``, an antisymmetric part a turn of the
-    axes); ``bias`` (3,), rad/s.
+    **Fields:** ``spin_inertia``, kg m^2, of the wheel (None: no wheel); ``axis`` (3,): unit vector
+    of its axis in sensor axes; ``delay``, s: a reading of the gyroscope corresponds to the speed of
+    the wheel ``delay`` earlier; ``skew`` (3, 3): symmetric, traceless deviation of the gyroscope's
+    sensitivity from one (a common factor is equivalent to one of ``spin_inertia``, an antisymmetric
+    part to a rotation of the axes); ``bias`` (3,), rad/s.
     """
 
     spin_inertia: Array | float | None
@@ -48,7 +48,7 @@ class Instrument(eqx.Module):
         return reading + jnp.einsum("ij,...j->...i", self.skew, reading)
 
     def carried(self, times: Float[Array, " t"], wheel: Float[Array, " t"]) -> Float[Array, "t 3"]:
-        """Momentum of the wheel relative to the body, sensor axes; linear between the samples."""
+        """Momentum of the wheel relative to the body, sensor axes; linear between samples."""
         if self.spin_inertia is None:
             return jnp.zeros((*times.shape, 3), times.dtype)
         speed = jnp.interp(times - self.delay, times, wheel)
@@ -56,7 +56,8 @@ class Instrument(eqx.Module):
 
 
 class Tolerance(NamedTuple):
-    """Prior standard deviations of the fields of an ``Instrument``; zero: not fitted.
+    """Prior standard deviations of the fields of an ``Instrument``; a field with zero is not
+    fitted.
 
     **Fields:** ``axis`` [rad]; ``delay`` [s]; ``skew``, relative; ``bias`` [rad/s].
     """
@@ -71,10 +72,10 @@ class Tolerance(NamedTuple):
 def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
     """Position (..., 3), m, of the accelerometer relative to the centre of mass, in free flight.
 
-    Linear least squares of ``force = alpha x r + omega x (omega x r) + R^T (a + b t)``: the angular
-    acceleration by central differences, and a drag of the air that changes little in space while
-    the body turns. ``averaged`` to samples of a few milliseconds the recording has less noise in
-    ``alpha``. Needs ``force`` and ``omega``.
+    Linear least squares of ``force = alpha x r + omega x (omega x r) + R^T (a + b t)``, with the
+    angular acceleration by central differences, and a drag that changes slowly in space while the
+    body rotates. A recording that is ``averaged`` to samples of a few milliseconds has less noise
+    in ``alpha``. The recording must have ``force`` and ``omega``.
     """
 
     def normal_equations(times, present, omega, force):
@@ -87,7 +88,7 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
         turn = jnp.swapaxes(attitudes(omega, slope, times), -1, -2)
         late = (times - times[0])[:, None, None]
         design = jnp.concatenate([jax.vmap(felt, out_axes=-1)(unit), turn, late * turn], axis=-1)
-        # a difference reaches to both neighbours
+        # a central difference uses both neighbours
         whole = present * jnp.roll(present, 1) * jnp.roll(present, -1)
         whole = whole.at[0].set(0).at[-1].set(0)
         design = design * whole[:, None, None]
@@ -100,6 +101,6 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
     parts = (recording.times, recording.present, recording.omega, recording.force)
     flat = [part.reshape(-1, *part.shape[len(batch) :]) for part in parts]
     systems = jax.vmap(normal_equations)(*flat)
-    # one after the other: batched calls of LAPACK can deadlock (jax below 0.12)
+    # sequentially: batched calls of LAPACK can deadlock (jax below 0.12)
     solutions = jax.lax.map(lambda system: jnp.linalg.solve(*system), systems)
     return solutions[:, :3].reshape(*batch, 3)

@@ -1,11 +1,12 @@
-"""How likely readings of gyroscope and wheel are, all that moves the body being uncertain.
+"""Likelihood of the readings of gyroscope and wheel under random torques and sensor noise.
 
-The gyroscope turns the frame, and the momentum ``L = R (I omega + h)`` is followed in it by a
-Kalman filter: drag and a torque with memory move it, and so does every error of the gyroscope,
-which turned the frame too. The rates that the filter expects are compared with those read. No
-measured rate stands on the side of the unknowns, so its noise does not pull the inertia down
-(errors in variables), and the determinants of the covariances make the likelihood that of the
-readings alone (the trajectory is integrated out: Schweppe, IEEE Trans. Inf. Theory 11 (1965) 61).
+The gyroscope's rates define a rotating frame, in which a Kalman filter propagates the momentum
+``L = R (I omega + h)``. Drag, a torque with a correlation time, and every error of the gyroscope,
+which also rotates the frame, change the momentum. The filter compares predicted with measured
+rates. Measured rates are never coefficients of the unknowns, so their noise does not bias the
+inertia towards zero (errors in variables), and with the determinants of the covariances the
+likelihood is that of the readings alone (the trajectory is integrated out: Schweppe, IEEE Trans.
+Inf. Theory 11 (1965) 61).
 """
 
 from typing import NamedTuple
@@ -28,10 +29,11 @@ from polhode.fit import Recording
 class Noise(NamedTuple):
     """Standard deviations of readings and disturbing torques, by body on the leading axis n.
 
-    ``omega``, rad/s: of a residual, and ``omega_wheel`` what the fastest wheel adds; ``torque``,
-    N m s^(1/2), of white torques and ``torque_wheel`` what the fastest wheel adds (both grow with
-    the square of its speed, as an imbalance does); ``slow``, N m, of a torque that forgets within
-    ``memory``, s; ``wheel``, rad/s: of the wheel's speed in a residual.
+    ``omega``, rad/s: noise of a residual, ``omega_wheel``: addition at the maximum wheel speed;
+    ``torque``, N m s^(1/2): white torques, ``torque_wheel``: addition at the maximum wheel speed
+    (both additions grow with the square of the speed, as for an imbalance); ``slow``, N m: a torque
+    with the correlation time ``memory``, s; ``wheel``, rad/s: noise of the wheel's speed in a
+    residual.
     """
 
     omega: Float[Array, "*n"]
@@ -49,10 +51,10 @@ class Noise(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Recordings (leading axis r) cut into blocks, each of which gives one residual.
+    """Recordings (leading axis r) cut into blocks, each of which provides one residual.
 
-    ``known`` (r, b): 1 where a block has rates and wheel; ``stir`` (r, b): square of the wheel's
-    speed over that of the fastest; ``body`` (r,): its number.
+    ``known`` (r, b): 1 if a block has rates and wheel speed; ``stir`` (r, b): squared speed of the
+    wheel relative to its maximum; ``body`` (r,): number of the body.
     """
 
     times: Float[Array, "*r t"]
@@ -83,25 +85,25 @@ def readings_of(recording: Recording, body: Array, block: int) -> Readings:
 
 
 class Innovations(NamedTuple):
-    """Rates read less those expected from all read before, and the covariances of that."""
+    """Measured rates minus those predicted from all earlier readings, and their covariances."""
 
     rest: Float[Array, "b 3"]
     covariance: Float[Array, "b 3 3"]
 
 
 class _Moved(NamedTuple):
-    """What a step of the filter is given of a block (leading axis: blocks)."""
+    """Inputs of a filter step for one block (leading axis: blocks)."""
 
     rates: Array  # mean rates
     carried: Array  # mean momentum of the wheel, body axes
     back: Array  # mean of R^T
-    turn: Array  # R in its middle
-    spun: Array  # what a rate's error does to the momentum within it
-    gained: Array  # momentum gained by drag
+    turn: Array  # R in the middle of the block
+    spun: Array  # derivative of the momentum gained in the block by the error of the rate
+    gained: Array  # momentum gained from drag
     span: Array
     known: Array
     omega: Array  # variance of the rates
-    torque: Array  # of the white torque's push
+    torque: Array  # variance of the impulse of the white torque
 
 
 def innovations(
@@ -111,10 +113,9 @@ def innovations(
     instrument: Instrument,
     noise: Noise,
 ) -> Innovations:
-    """Of one recording; ``drag``: linear, N m s, and quadratic, N m s^2, isotropic.
+    """Innovations of one recording; ``drag``: linear, N m s, and quadratic, N m s^2, isotropic.
 
-    Momenta are divided by half the trace of the tensor, so that all numbers are of the order of
-    rates.
+    Momenta are divided by half the trace of the tensor, so that all numbers have the size of rates.
     """
     count = data.known.shape[0]
     block = (data.times.shape[0] - 1) // count
@@ -149,7 +150,7 @@ def innovations(
         # momentum and slow torque (6,), the latter in body axes
         mean, spread = state
         back = inverse @ now.back
-        # what acts throughout a block has acted for half of it when its rates are read, on average
+        # mean rates are those in the middle of a block, when half of a torque's impulse has acted
         expects = jnp.concatenate([back, now.span / 2 * back @ now.turn], axis=1)
         rest = now.rates - (expects @ mean + back @ now.gained / 2 - inverse @ now.carried)
         heard = unit + back @ now.spun / 2
@@ -159,7 +160,7 @@ def innovations(
         shaken = now.torque * unit + now.omega * now.spun @ now.spun.T
         fresh = slow * (1 - stays**2) * unit
         zero = jnp.zeros_like(unit)
-        # the same error is in the reading and in the turn of the frame
+        # covariance: one error affects both the reading and the rotation of the frame
         both = jnp.concatenate([now.omega * now.spun @ heard.T, zero])
         gain = (moves @ spread @ expects.T + both) @ inverse_of(seen) * now.known
         mean = moves @ mean + jnp.concatenate([now.gained, jnp.zeros_like(rest)]) + gain @ rest
@@ -168,7 +169,7 @@ def innovations(
         found = Innovations(jnp.where(now.known > 0, rest, 0), jnp.where(now.known > 0, seen, unit))
         return (mean, (spread + spread.T) / 2), found
 
-    # nothing is known of the first momentum: its rates are as uncertain as rates are large
+    # diffuse prior of the initial momentum: the rms rate as the standard deviation of the rates
     wide = jnp.mean(speed**2)
     zero = jnp.zeros_like(unit)
     begin = jnp.block([[wide * body @ body.T, zero], [zero, slow * unit]])
@@ -188,15 +189,15 @@ def _hat(vector: Float[Array, "b 3"]) -> Float[Array, "b 3 3"]:
 
 
 def negative_log_likelihood(found: Innovations) -> Float[Array, ""]:
-    """Minus the logarithm of the likelihood, but for a constant."""
+    """Negative log-likelihood, up to a constant."""
     weighed = jnp.einsum("bi,bij,bj->", found.rest, inverse_of(found.covariance), found.rest)
     return (weighed + jnp.sum(jnp.log(cofactors_of(found.covariance)[0]))) / 2
 
 
 class Score(NamedTuple):
-    """``negative_log_likelihood``, its slopes by p unknowns, the information (expected second
-    slopes), and what was read less what was expected, over its standard deviation ``spread``,
-    rad/s."""
+    """``negative_log_likelihood``, its derivatives with respect to p unknowns, the Fisher
+    information, and the innovations over their standard deviation ``spread``, rad/s.
+    """
 
     negative_log_likelihood: Float[Array, "*r"]
     slope: Float[Array, "*r p"]
@@ -206,7 +207,7 @@ class Score(NamedTuple):
 
 
 def score_of(found: Innovations, by: Innovations) -> Score:
-    """Of innovations whose derivatives by p unknowns (last axis) are ``by``."""
+    """Score of innovations whose derivatives with respect to p unknowns (last axis) are ``by``."""
     inverse = inverse_of(found.covariance)
     pull = jnp.einsum("bij,bj->bi", inverse, found.rest)
     relative = jnp.einsum("bij,bjkp->bikp", inverse, by.covariance)

@@ -1,6 +1,6 @@
-"""Attitudes from rates, physical tensors from unbounded unknowns, and where a fit starts.
+"""Attitudes from rates, physical tensors from unconstrained unknowns, and starting points of a fit.
 
-The estimator's own: it uses ``polhode.fit`` by its public names only.
+Only public names of ``polhode.fit`` are used.
 """
 
 import math
@@ -15,15 +15,15 @@ from jaxtyping import Array, Float
 from polhode.inertia import inertia_of_second_moments, principal, second_moments
 from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
 
-# eigenvalues of the second moments, relative to their sum, around which they bend away from zero
+# scale of the smooth lower bound of the second moments' eigenvalues, relative to their sum
 _SOFT = 5e-3
-# second moments of a start below this part of their sum are lifted to it
+# lower bound of the second moments of a start, relative to their sum
 _FLATTEST = 3e-3
-# parts of a recording over each of which a start takes the momentum as constant
+# number of parts of a recording in each of which the start assumes a constant momentum
 _PIECES = 6
 _ROUNDS = 3
 SCALE = np.array([1, 1, 1, 0, 0, 0]) / np.sqrt(3)
-"""The direction of the six entries that changes the size of a tensor alone."""
+"""The direction of the six entries that changes only the size of a tensor."""
 
 
 def entries_of(tensor: Float[Array, "3 3"]) -> Float[Array, " 6"]:
@@ -40,7 +40,7 @@ def symmetric_matrix(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
 def central_differences(
     values: Float[Array, "t 3"], times: Float[Array, " t"]
 ) -> Float[Array, "t 3"]:
-    """Derivatives at samples of any spacing; those of the ends are one-sided."""
+    """Derivatives at samples of any spacing; one-sided at the ends."""
     step = jnp.diff(times)[:, None]
     between = jnp.diff(values, axis=0) / step
     inner = (between[1:] * step[:-1] + between[:-1] * step[1:]) / (step[1:] + step[:-1])
@@ -50,7 +50,7 @@ def central_differences(
 def interpolate_gaps(
     times: Float[Array, " t"], present: Float[Array, " t"], values: Float[Array, "t 3"]
 ) -> Float[Array, "t 3"]:
-    """Values whose gaps are bridged linearly; before the first and after the last they stay."""
+    """Values with linearly interpolated gaps, and constant before the first and after the last."""
     count = times.shape[0]
     place = jnp.arange(count)
     before = jax.lax.cummax(jnp.where(present > 0, place, -1))
@@ -69,7 +69,7 @@ def attitudes(
 ) -> Float[Array, "t 3 3"]:
     """Attitude matrices relative to the first sample, from rates and their derivatives.
 
-    Cubic Hermite interpolation, two Magnus steps of order 4 (two Gauss points) per interval.
+    Cubic Hermite interpolation; two Magnus steps of order 4 (two Gauss points) per interval.
     """
     step = jnp.diff(times)[:, None]
     offset = math.sqrt(3) / 12
@@ -89,8 +89,8 @@ def attitudes(
 
 
 def _running_products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Array:
-    # within the rows of a square, all rows at a time, then over the rows: derivatives of this
-    # program compile in half the time of those of ``associative_scan``
+    # prefix products within the rows of a square array, then over the rows: derivatives of this
+    # compile in half the time of those of ``associative_scan``
     count = turns.shape[0]
     side = math.isqrt(count - 1) + 1
     padded = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
@@ -107,7 +107,7 @@ def _running_products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> 
 
 
 def inverse_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """Inverses of symmetric matrices, written out."""
+    """Inverses of symmetric matrices, by explicit formulas."""
     determinant, cofactors = cofactors_of(matrix)
     return cofactors / determinant[..., None, None]
 
@@ -126,14 +126,14 @@ def cofactors_of(matrix: Float[Array, "*b 3 3"]) -> tuple[Array, Array]:
 
 
 class Origin(NamedTuple):
-    """Where unbounded unknowns of a tensor count from, and the size at which they bend."""
+    """Origin of the unconstrained unknowns of a tensor, and the scale of their nonlinearity."""
 
     entries: Float[Array, " 6"]
     soft: Float[Array, ""]
 
 
 def origin_of(sigma: Float[Array, "3 3"]) -> Origin:
-    """The origin whose tensor has the second moments ``sigma``."""
+    """The origin at which the tensor has the second moments ``sigma``."""
     soft = _SOFT * jnp.trace(sigma)
     return Origin(entries_of(sigma - soft**2 / 4 * inverse_of(sigma)), soft)
 
@@ -141,19 +141,20 @@ def origin_of(sigma: Float[Array, "3 3"]) -> Origin:
 def tensor_of(shape: Float[Array, " 6"], origin: Origin, columns: np.ndarray) -> Array:
     """Inertia tensor (3, 3), physical for any ``shape``, whose directions are ``columns`` (6, 6).
 
-    Second moments ``(S + sqrt(S^2 + soft^2)) / 2`` of a symmetric matrix S linear in ``shape``, as
-    in ``polhode.fit.FullTensor``: what the data leave open is a straight valley.
+    The second moments are ``(S + sqrt(S^2 + soft^2)) / 2`` of a symmetric matrix S that is linear
+    in ``shape``, as in ``polhode.fit.FullTensor``: directions that the data do not determine are
+    straight valleys of the likelihood.
     """
     change = jnp.sum(jnp.asarray(columns, shape.dtype) * shape[None], axis=1)
     values, axes, products = principal(
         symmetric_matrix(origin.entries + origin.soft / _SOFT * change)
     )
     root = jnp.sqrt(values**2 + origin.soft**2)
-    # without cancellation for negative eigenvalues
+    # avoids cancellation for negative eigenvalues
     bent = jnp.where(values > 0, (values + root) / 2, origin.soft**2 / (2 * (root - values)))
 
     # Divided differences of the same function times the products of the principal axes. These are
-    # zero, but their tangents are those of the turning axes.
+    # zero, but their tangents are those of the rotating axes.
     first, second = jnp.asarray([1, 2, 0]), jnp.asarray([2, 0, 1])
     ratio = (1 + (values[first] + values[second]) / (root[first] + root[second])) / 2
     inner = symmetric_matrix(jnp.concatenate([bent, ratio * products]))
@@ -168,10 +169,11 @@ def start_by_regression(
     present: Float[Array, "r t"],
     carried: Float[Array, "r t 3"] | None,
 ) -> Float[Array, "3 3"]:
-    """Second moments for which ``R (I omega + h)`` changes least within pieces of the recordings.
+    """Second moments for which ``R (I omega + h)`` varies least within pieces of the recordings.
 
-    ``carried``: momentum of the wheel, body axes; without it the size is that of a tensor of unit
-    Frobenius norm, and the rates between samples follow from Euler's equations of the round before.
+    ``carried``: momentum of the wheel, body axes. Without a wheel the tensor has unit Frobenius
+    norm, and rates between samples follow from Euler's equations with the tensor of the previous
+    iteration.
     """
     place = np.arange(times.shape[1]) * _PIECES // times.shape[1]
     pieces = jnp.asarray(place == np.arange(_PIECES)[:, None], omega.dtype)
@@ -232,8 +234,8 @@ def _nearest_physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
 def whiteness_of(rest: Float[Array, "r t 3"], present: Float[Array, "r t"], lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together.
 
-    Recordings without a sample count nothing. Chi-square of many degrees by Wilson and Hilferty
-    (PNAS 17 (1931) 684).
+    Recordings without samples are ignored. Chi-square with many degrees of freedom by Wilson and
+    Hilferty (PNAS 17 (1931) 684).
     """
     total = jnp.sum(present, axis=-1)[:, None]
     has_power = total > 0

@@ -1,10 +1,10 @@
-"""Inertia, drag, instrument and noise that make the readings of throws likeliest.
+"""Maximum-likelihood estimates of inertia, drag, instrument and noise from throws.
 
-Fisher's method of scoring on the likelihood of ``benchmarks.throws.likelihood``; tolerances of the
-instrument, and what is expected of drag and noise, are terms of it as well. A body that is found
-bends to the noise of the readings, and the scatter left tells too little of it: the noise is found
-by restricted likelihood, which counts what is used up by half the log-determinant of the
-information about all else (Patterson and Thompson, Biometrika 58 (1971) 545).
+Fisher scoring on the likelihood of ``benchmarks.throws.likelihood`` with priors for the instrument
+(its tolerances), drag and noise. The estimated bodies fit a part of the noise of the readings, so
+that the remaining scatter underestimates it: the noise is therefore estimated by the restricted
+likelihood, which adds half the log-determinant of the information about all other unknowns
+(Patterson and Thompson, Biometrika 58 (1971) 545).
 """
 
 import equinox as eqx
@@ -29,33 +29,32 @@ _SKEW[0] = np.diag([1, -1, 0]) / np.sqrt(2)
 _SKEW[1] = np.diag([1, 1, -2]) / np.sqrt(6)
 for _k, (_i, _j) in enumerate(((1, 2), (2, 0), (0, 1))):
     _SKEW[2 + _k, _i, _j] = _SKEW[2 + _k, _j, _i] = np.sqrt(0.5)
-# directions of the tensor: all six, or five and the size, which throws without a wheel do not show
+# directions of the tensor: all six, or five and the size, which needs a wheel
 _SIZED = np.eye(6)
 _SIZELESS = np.linalg.svd(SCALE[None])[2][::-1].T
-# Unknowns of a recording: of its body's tensor, drag and noise, of the noise that all share, of the
-# instrument.
+# Numbers of unknowns of a recording: tensor, drag and noise of its body, shared noise, instrument.
 _TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 11
 _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
-# Standard deviations expected: of the part of the spin that drag takes, of logarithms of the noise,
-# of its memory and of the wheel's noise
+# Prior standard deviations: of the relative loss of spin by drag, and of the logarithms of the
+# noise, of its correlation time and of the wheel's noise
 _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
-# steps at most, and the distance of the tensors from the best, in standard deviations, that ends
-# them (of all else: four times that)
+# maximum number of steps, and the distance of the tensors from the maximum [standard deviations]
+# at which the search ends (four times that for the other unknowns)
 _STEPS, _NEAR = 200, 0.03
-# how much a step may change logarithms of the noise
+# largest change of the logarithms of the noise in a step
 _LOUDER = 1.5
-# by how much logarithms of the noise are shifted for differences
+# step of the logarithms of the noise for finite differences
 _SHIFT = 1e-2
-# how often at most what the bodies use up is worked out anew
+# maximum number of updates of the restricted likelihood
 _ROUNDS = 5
 
 
 def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
-    """The instrument that lies ``unknown`` tolerances from the one given."""
+    """The instrument that deviates by ``unknown`` tolerances from the given one."""
     size = tolerance.skew * unknown[:5]
     skew = jnp.einsum("k,kij->ij", size, jnp.asarray(_SKEW, unknown.dtype))
     tilt = tolerance.axis * unknown[5:7]
-    # two directions at right angles to the axis
+    # two directions normal to the axis
     helper = jnp.where(jnp.argmin(jnp.abs(given.axis)) == jnp.arange(3), 1.0, 0.0)
     first = jnp.cross(given.axis, helper.astype(unknown.dtype))
     first = first / jnp.sqrt(jnp.sum(first**2))
@@ -71,7 +70,7 @@ def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: To
 
 
 class Known(eqx.Module):
-    """What the unknowns count from: bodies' second moments, the instrument, the noise."""
+    """Constants of the unknowns: second moments of the bodies, instrument, noise."""
 
     sigma: Float[Array, "n 3 3"]
     instrument: Instrument
@@ -79,7 +78,7 @@ class Known(eqx.Module):
     noise: Noise
 
     def tensor(self, shape: Float[Array, " 6"], sigma: Float[Array, "3 3"]) -> Array:
-        """The tensor (3, 3); without a wheel ``shape`` leaves its size alone."""
+        """The tensor (3, 3); without a wheel, ``shape`` does not change its size."""
         if self.instrument.spin_inertia is not None:
             return tensor_of(shape, origin_of(sigma), _SIZED)
         return tensor_of(shape.at[5].set(0), origin_of(sigma), _SIZELESS)
@@ -90,8 +89,8 @@ class Known(eqx.Module):
         sigma = self.sigma[body]
         tensor = self.tensor(shape, sigma)
         own = [x[body] * jnp.exp(y) for x, y in zip(self.noise[:_LEVEL], level, strict=True)]
-        # torques are as uncertain as the body is large: its size is not read off the scatter, which
-        # would pull it up by some 0.2 of its deviation where the wheel hardly moves the body
+        # torques scale with the body: otherwise the scatter would bias its estimated size by about
+        # 0.2 standard deviations upward if the wheel hardly moves the body
         grown = jnp.trace(tensor) / (2 * jnp.trace(sigma))
         shared = [x * jnp.exp(y) for x, y in zip(self.noise[_LEVEL:], common, strict=True)]
         instrument = instrument_of(device, self.instrument, self.tolerance)
@@ -104,7 +103,7 @@ class Known(eqx.Module):
 
 
 class Fitted(eqx.Module):
-    """Unknowns of a balance; ``covariance``: of the tensor's entries and the two drags."""
+    """Result of ``solve_balance``; ``covariance``: of the tensor's entries and the two drags."""
 
     tensors: Float[Array, "n 3 3"]
     drag: Float[Array, "n 2"]
@@ -119,20 +118,22 @@ class Fitted(eqx.Module):
 
 
 def _expected_square_sum(sized: bool) -> np.ndarray:
-    """Precisions of the unknowns of a recording, those of the tensor not expected at all."""
-    # a size that nothing depends on stays where it is
+    """Prior precisions of the unknowns of a recording; those of the tensor are zero."""
+    # without a wheel nothing depends on the size, which remains constant
     shape = [np.inf] * (_TENSOR - 1) + [np.inf if sized else 1.0]
     noise = [_WIDE] * _LEVEL + [_NARROW] * _COMMON
     return 1 / np.array(shape + [1.0] * _DRAG + noise + [1.0] * _DEVICE) ** 2
 
 
 def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
-    """The likeliest bodies. ``free``: "tensor" (and drag), "noise" as well, or "instrument" too."""
+    """The most likely bodies. ``free``: "tensor" (and drag), "noise" (in addition), or "instrument"
+    (all).
+    """
     count, recordings = known.sigma.shape[0], data.body.shape[0]
     ends = {"tensor": _PARTS[1], "noise": _PARTS[3], "instrument": _PARTS[3] + _DEVICE}
     used, own = int(ends[free]), int(min(ends[free], _PARTS[2]))
     dtype = known.sigma.dtype
-    # places of a recording's unknowns among all: its body's, then the common ones
+    # indices of a recording's unknowns: those of its body, then the shared ones
     common = count * own + np.arange(used - own)
     place = jnp.concatenate(
         [
@@ -145,7 +146,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     precision = jnp.asarray(
         np.concatenate([np.tile(expected[:own], count), expected[own:used]]), dtype
     )
-    # steps of the noise overshoot where it hardly shows, and are held back more than the others
+    # steps of poorly determined noise overshoot, and are damped more than the others
     noise = np.zeros(used, bool)
     noise[_PARTS[1] : _PARTS[3]] = True
     heard, others = np.flatnonzero(noise), np.flatnonzero(~noise)
@@ -158,7 +159,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     inner = first[:, :_TENSOR]
 
     def score_by(data: Readings, unknown, which) -> Score:
-        """Of one recording, by some of its unknowns."""
+        """Score of one recording with respect to some of its unknowns."""
 
         def found(part):
             missing = jnp.zeros(_PARTS[3] + _DEVICE - used, dtype)
@@ -179,18 +180,20 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         return Score(value, slope, shown, each.rest, each.spread)
 
     def used_up(unknown, information):
-        """Slopes, by the noise, of half the log-determinant of the information about all else."""
+        """Derivatives, with respect to the noise, of half the log-determinant of the information
+        about all other unknowns.
+        """
 
         def told(shift):
             each = jax.vmap(lambda data, own: score_by(data, own + shift, others))
             return each(data, unknown[place]).information
 
-        # by differences, for the program of second derivatives is several times as long
+        # by finite differences: the program of second derivatives is several times as large
         shifts = np.zeros((1 + heard.size, used))
         shifts[1 + np.arange(heard.size), heard] = _SHIFT
         every = jax.lax.map(told, jnp.asarray(shifts, dtype))
         bends = (every[1:] - every[:1]) / _SHIFT
-        # covariances, were the noise known
+        # covariances for known noise
         quiet = 1 - loud
         sure = jnp.linalg.inv(information * quiet[None] * quiet[:, None] + jnp.diag(loud))
         where = place[:, others]
@@ -199,12 +202,14 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         return jnp.zeros_like(unknown).at[place[:, heard]].add(found)
 
     def restricted(unknown, information, lost, rounds):
-        """What the restricted likelihood adds to the slopes, and how often it was worked out."""
-        # the mean of all so far: by themselves they may go to and fro
+        """Derivatives that the restricted likelihood adds, and the number of their updates."""
+        # the mean of all updates: single updates may oscillate
         return lost + (used_up(unknown, information) - lost) / (rounds + 1), rounds + 1
 
     def far(score, lost):
-        """How far from the likeliest all is, in standard deviations; bodies count in full."""
+        """Distance from the maximum in standard deviations: that of the bodies, or a quarter of
+        that of the other unknowns if it is larger.
+        """
         covariance = jnp.linalg.inv(score.information)
         left = covariance @ (score.slope + lost) / jnp.sqrt(jnp.diagonal(covariance))
         return jnp.maximum(jnp.max(jnp.abs(left[inner])), jnp.max(jnp.abs(left)) / 4)
@@ -232,7 +237,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         shown = score.information
         shown = shown + damping * jnp.diag(held * jnp.diagonal(shown))
         move = -jnp.linalg.solve(shown, score.slope + lost)
-        # from a start far off, noise so large that everything is likely would be a step away
+        # from a distant start a full step could make the noise so large that anything is likely
         move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
         return unknown, move, score, lost, rounds, damping, distance, steps + 1
 
@@ -240,7 +245,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         *_, distance, steps = carry
         return ~(distance < _NEAR) & (steps < _STEPS)
 
-    # the first round takes the place where it begins, whatever it is worth
+    # the first iteration accepts the starting point: the value before it is infinite
     zero, large = jnp.zeros(loud.size, dtype), jnp.asarray(jnp.inf, dtype)
     blank = jnp.zeros((*data.known.shape, 3), dtype)
     nothing = Score(large, zero, jnp.eye(loud.size, dtype=dtype), blank, blank)
@@ -254,7 +259,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     tensors, slowed, instrument, noise = jax.vmap(known.parts, in_axes=(0, 0, None))(
         every, bodies, drag
     )
-    # what all bodies share
+    # shared by all bodies
     instrument = jax.tree.map(lambda x: x[0], instrument)
     noise = Noise(*noise[:_LEVEL], *(x[0] for x in noise[_LEVEL:]))
 
@@ -283,7 +288,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
 
 
 def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array, Noise]:
-    """Second moments (n, 3, 3) by a regression with a constant momentum, and a noise."""
+    """Second moments (n, 3, 3) by a regression with constant momentum, and the noise."""
     rates = jax.vmap(instrument.rates)(data.omega)
     carried = None
     if instrument.spin_inertia is not None:
@@ -300,7 +305,7 @@ def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array,
             jnp.sum(weight[..., None] * rates**2) / jnp.maximum(jnp.sum(weight), 1)
         )
 
-    # one body after the other: batched calls of LAPACK can deadlock (jax below 0.12)
+    # one body after another: batched calls of LAPACK can deadlock (jax below 0.12)
     sigma, typical = jax.lax.map(one, jnp.arange(count))
     size = jnp.trace(sigma, axis1=1, axis2=2)
     span = data.times[0, -1] - data.times[0, 0]

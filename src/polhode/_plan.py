@@ -156,8 +156,8 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
     eps = float(jnp.finfo(scene.inertia.dtype).eps)
     if solution is None:
         reason = (
-            "something acts on the body: integrated in steps with an error estimate, held to"
-            " rtol at every saved time"
+            "no closed form applies: integrated, with an estimated error below rtol at every saved"
+            " time"
         )
         compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
         return _integration_method(_has_axis(scene), compensated, _low_order(scene, rtol)), reason

@@ -1,4 +1,4 @@
-"""docs/cli.md is written from the commands, and long commands show their progress."""
+"""docs/cli.md is generated from the commands, and long commands show their progress."""
 
 import io
 import sys
@@ -25,7 +25,7 @@ def test_the_page_is_that_of_the_commands():
 
 @pytest.fixture
 def terminal(monkeypatch):
-    """What people who watch see."""
+    """Output as a terminal shows it."""
     from rich.console import Console
 
     file = io.StringIO()

@@ -1,4 +1,4 @@
-"""The command line: what it writes and prints, its exit codes, and what is left after a failure."""
+"""The command line: what it writes and prints, its exit codes, and the files after a failure."""
 
 import importlib.util
 import json
@@ -45,7 +45,7 @@ moments = { relative_sigma = 0.01, source = "assumed: for the test" }
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """An empty current folder with the small scene in it."""
+    """An empty current folder that contains the small scene."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "top.toml").write_text(TOP)
     return tmp_path
@@ -88,7 +88,7 @@ def test_options_replace_the_scene(here, capsys):
         assert data.sizes["clone"] == 4
         assert data["wxyz"].dtype == np.float32
         first = data["moments"].values[1:]
-    again = ("--precision", "float32", "--no-figure", "-q")  # the same program
+    again = ("--precision", "float32", "--no-figure", "-q")  # reuses the compiled program
     assert run("top.toml", "--clones", 3, "--seed", 10, *again) == 0
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
@@ -112,7 +112,7 @@ def test_chunks_cover_every_body_once(here):
 
 
 def test_observations_within_the_times_are_compared(here):
-    """Backwards in time, at the first time, between samples, and outside on both sides."""
+    """Backward in time, at the first time, between samples, and outside on both sides."""
     from polhode.cli import _job
 
     text = """
@@ -154,7 +154,7 @@ def test_a_scene_with_a_wheel_runs(here, capsys):
 
 @pytest.mark.parametrize("name", ["nasa_brick", "symmetric_top"])
 def test_scenes_meet_the_reference_values_they_carry(name):
-    """Rates and attitudes recomputed with 34 digits, printed with 12 decimals or more."""
+    """Rates and attitudes recomputed with 34 digits, printed with 12 or more decimals."""
     from polhode.cli import _job
 
     job = _job.prepare(read_scene(SCENES / f"{name}.toml"), "float64")
@@ -259,7 +259,7 @@ def test_wrong_options_are_usage_errors(here, capsys, arguments, hint):
 
 
 def test_the_scenes_that_come_with_polhode(here, capsys):
-    """Listed, copied, and run by name from any folder; a file of that name comes first."""
+    """Listed, copied, and run by name from any folder; a file of that name takes precedence."""
     assert main(["scenes"]) == 0
     told = capsys.readouterr().out
     names = [path.stem for path in SCENES.glob("*.toml")]
@@ -358,7 +358,7 @@ def test_clones_that_do_not_finish_are_reported(here, capsys, monkeypatch):
 
 
 def test_an_interrupt_of_code_made_from_text_has_its_exit_code(tmp_path):
-    """With ``python -m`` Python alone would end by the signal, though it was caught."""
+    """With ``python -m`` Python would end by the signal although the interrupt was caught."""
     (tmp_path / "ended.py").write_text("""
 from polhode import cli
 def main():
@@ -376,8 +376,9 @@ cli.command()
 
 
 def test_an_interrupt_waits_for_the_end_of_an_import(tmp_path):
-    """An extension module of jaxlib that an exception leaves while it is initialised aborts the
-    process; and pydantic turns an interrupt into an error of its own."""
+    """An exception during the initialisation of an extension module of jaxlib aborts the process,
+    and pydantic turns an interrupt into an error of its own.
+    """
     (tmp_path / "slow_module.py").write_text("""
 import os, signal
 os.kill(os.getpid(), signal.SIGINT)
@@ -430,7 +431,7 @@ def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         signal.signal(signal.SIGINT, before)
         deadline = time.monotonic() + 120
-        # the folder is made once the scene is read and the work is about to begin
+        # the folder is created after the scene is read, just before the computation
         while not output.parent.exists() and time.monotonic() < deadline:
             assert process.poll() is None
             time.sleep(0.05)
@@ -481,7 +482,7 @@ def test_the_reference_motions_are_written(here, capsys):
 
 @pytest.mark.parametrize("clones", [0, 3])
 def test_wheels_with_friction_are_written_as_simulated(tmp_path, monkeypatch, clones):
-    """Without an external torque the momentum in space is constant, also in the file."""
+    """Without external torque the momentum in space is constant, also in the file."""
     monkeypatch.chdir(tmp_path)
     text = (
         TOP.partition("[potential]")[0]

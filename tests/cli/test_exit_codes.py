@@ -45,7 +45,7 @@ TEXTS = {
 ANY = ("Traceback", "Errno", "ValueError", "--debug", "pip install")
 
 CASES = [
-    # unknown commands, and files in the place of a command
+    # unknown commands, and files in place of a command
     ("simulate tip.toml", 2, ["No such command", "'run'"]),
     ("plot tip.nc", 2, ["'view'"]),
     ("light-curve light.csv", 2, ["'lightcurve'"]),
@@ -173,7 +173,7 @@ CASES = [
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A folder with good and bad input of every kind."""
+    """A folder with valid and invalid input of every kind."""
     monkeypatch.chdir(tmp_path)
     for name, text in TEXTS.items():
         (tmp_path / name).write_text(text)
@@ -194,7 +194,7 @@ def test_exit_code_and_message(here, capsys, command, code, words):
     before = sorted(os.listdir(here))
     try:
         found = main(command.split())
-    except SystemExit as ended:  # wrong options, as typer finds them
+    except SystemExit as ended:  # options that typer rejects
         found = ended.code
     told = capsys.readouterr()
     assert found == code, told.err

@@ -1,4 +1,4 @@
-"""What a careless or hostile user gives: every case ends with one message and the right code."""
+"""Careless or hostile input: every case ends with one message and the right exit code."""
 
 import contextlib
 import datetime
@@ -46,14 +46,14 @@ moments = "m.npy"
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """An empty current folder with the small scene in it."""
+    """An empty current folder that contains the small scene."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "free.toml").write_text(FREE)
     return tmp_path
 
 
 def refused(capsys, arguments, code, *hints):
-    """The command ends with the code and one clean message with the hints."""
+    """Run a command that must end with this exit code and one message that contains the hints."""
     assert main([str(a) for a in arguments]) == code
     told = capsys.readouterr()
     assert told.out == ""
@@ -153,7 +153,7 @@ def test_only_files_of_polhode_are_replaced_unasked(here, capsys):
     refused(capsys, ["run", "free.toml"], 1, "free.png", "--force")
     assert not (here / "free.nc").exists()
     assert main(["run", "free.toml", "-q", "--force"]) == 0
-    assert main(["run", "free.toml", "-q"]) == 0  # both are ours now
+    assert main(["run", "free.toml", "-q"]) == 0  # now polhode has written both files
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_relative_moments_have_units_that_fit_each_other(here):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_that_a_callback_swallowed_still_ends_the_run(here, capsys, monkeypatch, number):
-    """As JAX's callbacks do: the exception is printed and forgotten."""
+    """JAX's callbacks print an exception and discard it."""
     simulate = ph.simulate
 
     def swallowing(*given, **options):
@@ -328,7 +328,7 @@ def test_an_interrupt_after_the_first_file_names_it(here, capsys, monkeypatch):
 
 
 def _modules(*arguments):
-    """Exit code and heavy modules of a command in a process of its own."""
+    """Exit code of a command in a new process, and the heavy modules that it imports."""
     code = (
         "import sys\n"
         "from polhode.cli import main\n"
@@ -380,9 +380,9 @@ def test_programs_are_kept_between_runs_unless_told_otherwise(here, monkeypatch)
         jax.config.update("jax_compilation_cache_dir", before)
 
 
-@pytest.mark.slow  # two processes without programs
+@pytest.mark.slow  # two processes without compiled programs
 def test_a_damaged_cache_is_no_error(here):
-    """In processes of their own: what is compiled is shared within one."""
+    """In new processes, since compiled programs are shared within one."""
     environment = os.environ | {"POLHODE_CACHE": str(here / "kept")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     command = [sys.executable, "-m", "polhode", "run", "free.toml", "--no-figure", "-q"]

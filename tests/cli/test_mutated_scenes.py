@@ -1,4 +1,4 @@
-"""Scene files with mistakes of every kind: one message and an exit code, no traceback, no hang."""
+"""Scene files with random mistakes: one message and an exit code, no traceback, no hang."""
 
 import random
 import re
@@ -68,7 +68,7 @@ def mutated(text: str, seed: int) -> str:
 @pytest.mark.timeout(600)
 @pytest.mark.filterwarnings("ignore")
 def test_five_hundred_mutated_scenes(tmp_path, monkeypatch):
-    """Read and built; every problem is the one error, of a few lines that a terminal can show."""
+    """Read and build each; every problem is a SceneFileError of a few printable lines."""
     refused = 0
     for seed in range(500):
         text = mutated(SCENES[seed % len(SCENES)], seed)
@@ -94,4 +94,4 @@ def test_mutated_scenes_through_the_command_line(tmp_path, monkeypatch, capsys, 
         assert main(["explain", "mutated.toml"]) in (0, 1, 2), seed
         told = capsys.readouterr()
         assert "Traceback" not in told.err, seed
-        assert "--debug" not in told.err, (seed, told.err)  # what is not foreseen ends so
+        assert "--debug" not in told.err, (seed, told.err)  # the message of an unexpected error

@@ -1,4 +1,4 @@
-"""The main job on asteroid 4179 Toutatis, against published numbers."""
+"""A complete run for asteroid 4179 Toutatis, against published numbers."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def _angle(left, right):
 
 def test_misfits_to_the_radar_observations_are_those_of_principia():
     file = read_scene(SCENE)
-    few = file.monte_carlo.model_copy(update={"clones": 60})  # as below: the same programs
+    few = file.monte_carlo.model_copy(update={"clones": 60})  # as below, to use the same programs
     job = _job.prepare(file.model_copy(update={"monte_carlo": few}), "float64")
     seen = job.file.observations
     ts = np.concatenate([[0.0], seen.seconds])
@@ -59,7 +59,7 @@ def test_misfits_to_the_radar_observations_are_those_of_principia():
     last_digit = np.array([0.001, 0.1, 0.1, 0.1, 0.1])
     slack = np.where(printed >= 10, 1.0, last_digit)
     assert (np.abs(np.stack(columns, axis=-1) - printed) <= slack).all()
-    # and the command's own comparison agrees with the largest axis error, being a rotation
+    # the comparison that the command prints is a rotation angle, close to the largest axis error
     residuals = _job.run(job, lambda _: None).residuals
     assert residuals.angle.shape == (17,)
     assert (

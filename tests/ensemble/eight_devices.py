@@ -1,4 +1,4 @@
-"""Run by the tests with 8 host devices: prints what each comparison gave, as JSON."""
+"""Script for tests with 8 host devices: prints the results of several comparisons as JSON."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def exchanges(compiled):
 
 
 def compare(scene, state, spread, place, method=None):
-    """What plain `simulate` makes of a batch placed by hand, beside the batch on one device."""
+    """Result of `simulate` for a manually sharded batch, compared with the batch on one device."""
     calls = []
     run = _simulate.run
     _simulate.run = lambda *given: calls.append(given) or run(*given)

@@ -1,4 +1,4 @@
-"""A small ensemble for the tests, also run as a program that is killed while it works."""
+"""A small ensemble for the tests, also a script that is killed while it runs."""
 
 import itertools
 import os
@@ -18,7 +18,7 @@ CHUNK = 8192
 
 
 def make(bodies=40_000, seed=7, rate=0.3, dtype=jnp.float64):
-    """Axisymmetric bodies: they compile fast."""
+    """Axisymmetric bodies, which compile fast."""
     scene = ph.Scene(ph.Inertia.axisymmetric(dtype(1.0), dtype(1.5)))
     state = ph.State(jnp.array([1.0, 0, 0, 0], dtype), jnp.array([0.1, 1.0, 0.2], dtype))
     spreads = (ens.AnyAttitude(), ens.SpreadRates(ens.Deviate(jnp.full(3, rate, dtype))))
@@ -27,7 +27,7 @@ def make(bodies=40_000, seed=7, rate=0.3, dtype=jnp.float64):
 
 def main(path, kill_at, part="1/1"):
     """Run the case. With ``kill_at`` k above 0 the process is killed when the k-th file of a chunk
-    is complete; below 0, just before that, when only its temporary file is there.
+    is complete; below 0, just before, when only its temporary file exists.
     """
     jax.config.update("jax_enable_x64", True)
     count_files(int(kill_at))

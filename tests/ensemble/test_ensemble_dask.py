@@ -1,4 +1,4 @@
-"""Chunks computed by the workers of a local dask cluster, of which one is killed."""
+"""Chunks computed by the workers of a local dask cluster, one of which is killed."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ from ensemble_case import CHUNK, TS, make
 
 from polhode.ensemble._statistics import tilt
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of dask's own start and end
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings when dask starts and stops
 TILT = ens.Statistic("tilt", tilt, "rad", 0.0, 3.2, 64)
 
 
@@ -34,7 +34,7 @@ def whole(tmp_path_factory):
 
 
 def test_an_active_client_computes_the_chunks(whole, tmp_path):
-    """Its worker is a thread of this process, which takes no time to start."""
+    """Its worker is a thread of this process, which starts immediately."""
     path, reports = tmp_path / "client.zarr", []
     options = {"dashboard_address": None, "processes": False, "n_workers": 1}
     with distributed.LocalCluster(threads_per_worker=2, **options) as cluster:
@@ -98,8 +98,8 @@ ensemble = { bodies = 20, seed = 1, attitude = { any = true } }
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_changes_no_bit(whole, tmp_path):
-    """Two worker processes, the address of the scheduler, and a function of this module; one
-    worker is killed after the first chunk.
+    """Two worker processes, the address of the scheduler, and a function of this module; one worker
+    is killed after the first chunk.
     """
     path, killed = tmp_path / "killed.zarr", []
     options = {"dashboard_address": None, "n_workers": 2, "threads_per_worker": 1}

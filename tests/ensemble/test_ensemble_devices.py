@@ -1,4 +1,4 @@
-"""Eight forced host devices give the bits of one, without a collective in the compiled program."""
+"""Eight virtual devices give the same bits as one, and the program contains no collective."""
 
 import json
 import subprocess

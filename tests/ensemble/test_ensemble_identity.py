@@ -1,4 +1,4 @@
-"""What makes two runs the same: structure, static fields and numbers count, addresses do not."""
+"""Identity of two runs: it depends on structure, static fields and numbers, not on addresses."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ from polhode.ensemble._store import digest, has_user_code
 
 
 def things():
-    """Things that must all differ."""
+    """Objects that must all have different identities."""
     normal = ens.SpreadRates(ens.Deviate(jnp.ones(3)))
     return {
         "normal": normal,
@@ -67,7 +67,7 @@ def test_rows_of_arrays_are_read_in_parts(monkeypatch):
 
 
 class Mine(ens.SpreadRates):
-    """A spread of the user's."""
+    """A user-defined spread."""
 
 
 def function(key, scene, state):

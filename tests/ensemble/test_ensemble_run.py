@@ -1,4 +1,4 @@
-"""Ensembles: what a body is, what a store holds, and what is left after a kill."""
+"""Ensembles: the bodies that are drawn, the contents of a store, and recovery after a kill."""
 
 import errno
 import itertools
@@ -66,7 +66,7 @@ class Gain(eqx.Module):
 
 
 def shared_parts():
-    """Scenes that hold arrays without axes of bodies, by what holds them."""
+    """Scenes with arrays that have no body axis, by the part that contains them."""
     body, t = ph.Inertia.from_moments([1.0, 1.5, 2.0]), np.linspace(0.0, 9.0, 5)
     table = ph.Table(t, np.stack([np.sin(t), np.cos(t), 0 * t + 0.3], -1), order=1)
     rods = ph.MagneticDipole(
@@ -204,7 +204,7 @@ def test_chunks_and_parts_change_no_bit(whole, tmp_path):
 
 @pytest.mark.parametrize(("parts", "chunks"), [(1, 1), (2, 3), (5, 5), (9, 5)])
 def test_there_is_a_chunk_for_each_part(parts, chunks, tmp_path):
-    """As far as there are blocks: 40,000 bodies are five blocks of 8,192."""
+    """If there are enough blocks: 40,000 bodies are five blocks of 8,192."""
     job = Job(make(), TS, tmp_path, None, None, True, (), jax.local_devices()[:1])
     assert -(-40_000 // chunk_sizes(job, None, None, parts).chunk) == chunks
 
@@ -220,7 +220,7 @@ def test_parts_that_begin_together_share_a_store(whole, tmp_path):
 
 
 def test_summaries_may_be_written_at_the_same_time(whole, tmp_path):
-    """By processes that finish together: each replaces files, and removes none."""
+    """By processes that finish together: each replaces files, and none removes them."""
     path = tmp_path / "both.zarr"
     shutil.copytree(whole, path)
     job = Job(make(), TS, path, None, None, True, (TILT,), jax.local_devices()[:1])
@@ -245,10 +245,10 @@ def test_a_kill_costs_the_chunks_in_progress(whole, tmp_path):
     path, k = tmp_path / "killed.zarr", random.randint(1, 15)
     killed(path, -k)
     assert list(tmp_path.rglob("*.partial"))
-    (tmp_path / ".killed.zarr.ab12.partial").mkdir()  # of one that was killed while it made it
+    (tmp_path / ".killed.zarr.ab12.partial").mkdir()  # left by a process that was killed
     for left in tmp_path.rglob("*.partial"):
         os.utime(left, (0, 0))
-    (tmp_path / ".killed.zarr.cd34.partial").mkdir()  # of one that makes it now
+    (tmp_path / ".killed.zarr.cd34.partial").mkdir()  # of a process that is still running
     ens.stream(make(), TS, path, chunk=CHUNK)
     assert equal(path, whole), k
     assert [left.name for left in tmp_path.rglob("*.partial")] == [".killed.zarr.cd34.partial"]
@@ -303,7 +303,7 @@ def test_own_functions_need_a_name(tmp_path):
 
 
 def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch):
-    """Full, or beyond the quota of the user."""
+    """The disk is full, or the quota of the user is exceeded."""
     path = tmp_path / "full.zarr"
     replace = Path.replace
     for code in (errno.ENOSPC, errno.EDQUOT):
@@ -324,7 +324,7 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch):
 
 @pytest.fixture
 def disk(tmp_path):
-    """A folder on a small disk of its own; ``disk(options)`` mounts it again."""
+    """A folder on a small separate disk; ``disk(options)`` mounts it again."""
     folder = tmp_path / "disk"
     folder.mkdir()
 
@@ -375,7 +375,7 @@ def test_bad_sizes_are_refused(tmp_path):
 
 
 def test_spreads_of_one_name_draw_independently():
-    """Two lambdas share their name; their draws must not be the same numbers."""
+    """Two lambdas have the same name, but their draws must differ."""
 
     def shifted(axis):
         def spread(key, scene, state):
@@ -396,7 +396,9 @@ def test_spreads_of_one_name_draw_independently():
 
 
 def test_the_tolerance_chooses_the_method():
-    """As in ``ph.simulate``: near rounding the frequencies of free bodies are compensated."""
+    """As in ``ph.simulate``: for an rtol near rounding the frequencies of free bodies are
+    compensated.
+    """
     bodies = ens.Ensemble(ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0])), STATE, 8)
     for rtol in (None, 1e-13):
         block = Block(bodies, np.asarray(TS), None, rtol, True, (), jax.devices()[:1])
@@ -406,7 +408,7 @@ def test_the_tolerance_chooses_the_method():
 
 
 def test_the_last_bin_holds_its_end():
-    """As that of ``numpy.histogram``, so that quantiles of what sits at an end are known."""
+    """As in ``numpy.histogram``, so that quantiles of values at the upper end are finite."""
     at_end = ens.Statistic("one", lambda t: jnp.ones_like(t.energy), "1", 0.0, 1.0, 4)
     ts = jnp.array([0.0, 1.0])
     states = ph.State(jnp.tile(STATE.wxyz, (4, 1)), jnp.tile(STATE.omega_body, (4, 1)))

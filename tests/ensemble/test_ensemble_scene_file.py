@@ -1,4 +1,4 @@
-"""The [ensemble] of a scene file: what it draws, what it refuses, and `polhode run` of it."""
+"""The [ensemble] of a scene file: what it draws, what it rejects, and `polhode run`."""
 
 import os
 import signal
@@ -153,7 +153,7 @@ def test_bad_options_change_nothing(options, words, tmp_path, capsys):
     scene.write_text(SCENE)
     try:
         code = main(["run", str(scene), "-o", str(tmp_path / "big.zarr"), *options])
-    except SystemExit as ended:  # options that typer refuses
+    except SystemExit as ended:  # options that typer rejects
         code = ended.code
     assert code == 2
     assert words in capsys.readouterr().err
@@ -211,7 +211,7 @@ def test_run_writes_resumes_and_refuses(tmp_path, capsys):
 
 
 def test_heavy_tops_on_their_axis_follow_the_closed_form():
-    """The method of an ensemble is chosen without numbers, so that the scene must say it."""
+    """The method of an ensemble depends on types only, so the scene must declare the symmetry."""
     import jax
 
     import polhode as ph
@@ -241,7 +241,7 @@ def test_spread_moments_keep_the_principal_axes():
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_says_how_it_goes_on(number, tmp_path, monkeypatch, capsys):
-    """Its chunks are in the store already: "no file was changed" would be wrong."""
+    """The store already contains chunks: "no file was changed" would be wrong."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "s.toml").write_text(SCENE)
     monkeypatch.setattr(ens, "stream", lambda *_, **__: os.kill(os.getpid(), number))
@@ -288,7 +288,7 @@ def test_a_momentum_includes_that_of_the_wheels(loose, tmp_path):
 
 
 def test_the_method_is_that_of_the_bodies_drawn(tmp_path):
-    """A symmetric top whose moments are spread has three of them."""
+    """A symmetric top whose moments are spread has three different moments."""
     scene = ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(1.0, 0.3))
     spread = ens.SpreadMoments(ens.Deviate(jnp.full(3, 0.02)))
     ensemble = ens.Ensemble(scene, TURNING, 4, (spread,))

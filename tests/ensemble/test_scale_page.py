@@ -1,4 +1,4 @@
-"""The tables of docs/scale.md are those of the committed results."""
+"""The tables of docs/scale.md agree with the committed results."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Stores that lost something or were altered: completed to the same bits, or refused."""
+"""Stores with missing or altered files: completed to the same bits, or rejected."""
 
 import json
 import os
@@ -55,7 +55,7 @@ def _settings(path, change):
 
 
 def _left(path):
-    """A file that was left half-written long ago."""
+    """An incomplete file from an earlier run."""
     path.write_text("x")
     os.utime(path, (0, 0))
 
@@ -164,7 +164,7 @@ def test_settings_that_are_not_possible_are_refused(whole, tmp_path, change):
 
 
 def test_chunks_that_equal_the_fill_value_are_written(tmp_path):
-    """By default Zarr leaves such chunks out, and a lost chunk would read as one of them."""
+    """By default Zarr omits such chunks; a lost chunk would then read as one of them."""
     import jax.numpy as jnp
 
     import polhode as ph

@@ -1,4 +1,4 @@
-"""The public contract of ``polhode.fit``: its names, their annotations, options and results."""
+"""The public interface of ``polhode.fit``: names, annotations, options and results."""
 
 import inspect
 
@@ -141,9 +141,9 @@ SCENE = ph.Scene(BODY, torque=ph.LinearDamping(0.1))
 @pytest.mark.parametrize(
     ("options", "data", "more", "message"),
     [
-        ({"motion": fit.FreeMotion()}, {}, {}, "has no use for the option motion"),
-        ({"unknown": fit.MomentsOnly()}, {}, {}, "has no use for the option unknown"),
-        ({"initial_inertia": BODY}, {}, {}, "has no use for the option initial_inertia"),
+        ({"motion": fit.FreeMotion()}, {}, {}, "does not use the option motion"),
+        ({"unknown": fit.MomentsOnly()}, {}, {}, "does not use the option unknown"),
+        ({"initial_inertia": BODY}, {}, {}, "does not use the option initial_inertia"),
         ({"mounting": True}, {}, {}, "does not fit a mounting"),
         ({}, {"wheel_speed": TIMES}, {}, "does not read wheel_speed"),
         ({}, {"force_body": RATES}, {}, "does not model accelerometer readings"),

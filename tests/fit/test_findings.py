@@ -1,4 +1,4 @@
-"""Saturated sensors and outliers are named; clean and coarsely digitised records are not."""
+"""Saturated sensors and outliers are reported; clean and coarsely digitised recordings are not."""
 
 import dataclasses
 
@@ -63,7 +63,7 @@ def test_constant_rates_are_not_saturated():
 
 
 def test_digitised_rates_that_hardly_vary_are_not_saturated():
-    """Most of their readings are one number, and the next one is rare."""
+    """Most of their readings have one value, and its neighbours are rare."""
     omega = np.stack([0.1 * np.sin(T), 0.1 * np.cos(T), np.full(T.size, 1.43)], -1)
     for place, other in ((slice(0, 44), 1.42), (slice(0, 1), 1.44)):
         omega[:, 2] = 1.43
@@ -84,15 +84,15 @@ def test_single_samples_far_off_are_outliers_and_runs_are_not():
     some = rest.copy()
     some[0, rng.choice(500, 8, replace=False), 1] += 15
     assert has_outliers(jnp.asarray(some), whole, None)
-    # the fit is robust already
+    # with a robust fit
     assert not has_outliers(jnp.asarray(some), whole, object())
-    # a model that lacks something
+    # an incomplete model
     wrong = rest + 10 * (np.sin(T) > 0.9)[None, :, None]
     assert not has_outliers(jnp.asarray(wrong), whole, None)
-    # samples that are not there
+    # missing samples
     gaps = dataclasses.replace(whole, present=jnp.asarray(np.abs(some[..., 1]) < 6, float))
     assert not has_outliers(jnp.asarray(some), gaps, None)
-    # readings at a limit, whose residuals are zero while the model is beyond it
+    # saturated readings, whose residuals are zero while the model exceeds the limit
     limits = np.zeros((1, 500, 3))
     limits[0, :400, 2] = 1
     at_limit = rest * (limits == 0)
@@ -102,7 +102,7 @@ def test_single_samples_far_off_are_outliers_and_runs_are_not():
 
 @pytest.mark.parametrize("gaps", [0.0, 0.5, 0.9])
 def test_white_residuals_are_white_beside_gaps(gaps):
-    """Their probabilities are uniform: of 300, 15 +- 4 lie below 0.05."""
+    """Their probabilities are uniform: of 300, 15 +- 4 are below 0.05."""
     rng = np.random.default_rng(0)
     present = (rng.uniform(size=(300, 1, 200)) >= gaps).astype(float)
     residuals = rng.normal(size=(300, 1, 200, 3)) * present[..., None]
@@ -117,8 +117,9 @@ def test_white_residuals_are_white_beside_gaps(gaps):
 
 
 def test_spin_about_one_axis_agrees_with_attitudes_and_against_it_does_not():
-    """Noise alone turns the axes across; an inverted axis turns the body the other way. Beside a
-    bias a spin about one axis shows no axes."""
+    """Noise alone determines the transverse axes; an inverted axis reverses the rotation. With a
+    bias, a spin about one axis does not determine the axes.
+    """
     spin = ph.State([1.0, 0, 0, 0], [0.0, 0, 2.0])
     motion = ph.simulate(ph.Scene(ph.Inertia.spherical(1.0)), spin, np.linspace(0, 6, 121))
     options = FitOptions(), FitOptions(bias=True)
@@ -137,12 +138,14 @@ def test_spin_about_one_axis_agrees_with_attitudes_and_against_it_does_not():
     [(0.4, 0.06, True), (0.4, 0.04, False), (0.016, 0.016, True), (0.016, 0.007, False)],
 )
 def test_ratios_that_hardly_show_are_weak(ratio, std, weak):
-    """A rod spinning across its axis does not show the moment about it: 0.016 +- 0.016 of 0.38."""
+    """A rod that spins across its axis hardly determines the moment about it: 0.016 +- 0.016 of
+    0.38.
+    """
     assert bool(is_weak(jnp.array([ratio, 1.0, 1.0]), jnp.array([std, 0.0, 0.0]))) == weak
 
 
 def test_sensor_axes_of_coarse_samples():
-    """Turns of two radians between samples are compared as angles, not as their sines."""
+    """Rotations of two radians between samples are compared as angles, not as sines."""
     body = ph.Inertia.spherical(1.0)
     motion = ph.simulate(
         ph.Scene(body), ph.State([1.0, 0, 0, 0], [1.0, 2.0, 2.5]), 0.6 * np.arange(9)
@@ -176,8 +179,9 @@ def test_fits_name_clipped_records_and_outliers():
 
 
 def test_errors_of_moments_that_are_nearly_equal_hold_what_drives_them_apart():
-    """Eigenvalues of tensors with noise in every entry, beside the noise itself, which is 5 times
-    the gap. To first order the products of inertia change none of them."""
+    """Eigenvalues of tensors with noise in every entry, compared with the noise, which is 5 times
+    the gap. To first order the products of inertia do not change the eigenvalues.
+    """
     rng = np.random.default_rng(3)
     moments, noise = np.array([1.0, 1.002, 2.0]), 0.01
     errors = noise * rng.normal(size=(4000, 3, 3))
@@ -192,4 +196,4 @@ def test_errors_of_moments_that_are_nearly_equal_hold_what_drives_them_apart():
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all((rms > 0.8) & (rms < 1.2)), rms
     alone = np.sqrt(np.mean((found[:, :2] - moments[:2]) ** 2, axis=0)) / noise
-    assert np.all(alone[:2] > 1.3), alone  # without what is added the intervals would be too narrow
+    assert np.all(alone[:2] > 1.3), alone  # without the addition the intervals would be too narrow

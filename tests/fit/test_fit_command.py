@@ -1,4 +1,4 @@
-"""``polhode fit``: a recording in, a table, numbers and a figure out; bad files named as such."""
+"""``polhode fit``: from a recording to a table, numbers and a figure; errors for bad files."""
 
 import json
 
@@ -14,7 +14,7 @@ from polhode.fit._numerics import compiled
 
 @pytest.fixture
 def toss(tmp_path):
-    """A long box tumbling freely, by small Runge-Kutta steps, in deg/s, with noise and a gap."""
+    """A long box that tumbles freely, by small Runge-Kutta steps, in deg/s, with noise and gap."""
     moments = np.array([1.0, 2.6, 3.2])
     rng = np.random.default_rng(5)
 
@@ -69,7 +69,7 @@ def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
     assert "NaN" not in output.with_suffix(".json").read_text()
 
 
-@pytest.mark.slow  # the command: the test above
+@pytest.mark.slow  # faster: the command, the test above
 def test_a_recording_that_shows_nothing_ends_with_an_error(tmp_path, capsys):
     path = tmp_path / "still.csv"
     path.write_text("t,wx,wy,wz\n" + "".join(f"{k / 100},0,0,0\n" for k in range(60)))
@@ -84,7 +84,7 @@ def test_a_recording_that_shows_nothing_ends_with_an_error(tmp_path, capsys):
 
 @pytest.mark.slow  # compiles for half a minute
 def test_a_wheel_shows_the_size(tmp_path, capsys):
-    """A wheel that is driven up at a steady pace, along the axis y."""
+    """A wheel along the y axis that accelerates uniformly."""
     times = np.linspace(0, 2, 101)
     moments = np.array([2e-4, 3e-4, 3.5e-4])
     flight = SteppedMotion(1e-6, (0.0, 1.0, 0.0), steps=4)
@@ -104,7 +104,7 @@ def test_a_wheel_shows_the_size(tmp_path, capsys):
     found = json.loads(out.with_suffix(".json").read_text())
     off = (np.array(found["moments"]) - moments) / np.array(found["moments_std"])
     assert np.abs(off).max() < 4
-    for name in ("linear", "quadratic"):  # there is none
+    for name in ("linear", "quadratic"):  # there is no drag
         assert abs(found["drag"][name]) < 4 * found["drag_std"][name] < 1e-4
     assert np.all(np.array(found["moments_std"]) < 0.05 * moments)
 
@@ -152,4 +152,4 @@ def test_programs_for_brief_fits_give_the_same():
         expected = np.sin(np.arange(5.0)) @ np.linspace(0, 1, 5)
         np.testing.assert_allclose(run(x), expected, rtol=1e-14)
         np.testing.assert_allclose(jax.jit(run)(x), expected, rtol=1e-14)
-    assert asked == [5, 5]  # not where the fit is a part of another program
+    assert asked == [5, 5]  # not if the fit is a part of another program

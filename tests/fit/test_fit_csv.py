@@ -1,4 +1,4 @@
-"""Recordings from CSV files: what is read, and what is refused with which words."""
+"""Recordings from CSV files: what is read, and the errors for invalid files."""
 
 import jax
 import numpy as np
@@ -40,7 +40,7 @@ def test_a_good_file(tmp_path):
         ("a\0b", "not text in UTF-8"),
         ("time,x,y,z\n0,1,2,3\n", "at least 4 rows"),
         (GOOD.replace(",1,", ",400,"), "deg/s"),
-        # decimal commas between commas
+        # decimal commas in comma-separated columns
         (GOOD.replace("0.1,1,2,3,9", "1,0,1,0,2,0,3"), "line 3 has 7 cells, its header 5; .*semi"),
     ],
 )
@@ -127,7 +127,7 @@ def test_usual_names_and_units_are_found(tmp_path, head, factor, seconds):
 def test_names_that_could_mean_several_things_are_refused(tmp_path, head, message):
     path = tmp_path / "odd.csv"
     path.write_text(f"{head}\n" + "".join(f"{k / 10},1,2,3,7\n" for k in range(6)))
-    if message is None:  # a name that is the role's own is taken
+    if message is None:  # a column with the name of a role is accepted
         assert load_recording(path).columns["wx"] == "wx"
         return
     with pytest.raises(ValueError, match=message):
@@ -154,7 +154,7 @@ def test_a_column_has_one_role_and_one_unit(tmp_path):
         read_recording(path, roles, scale=np.pi / 180)
     with pytest.raises(ValueError, match=r"in s by the names .* read as ms"):
         read_recording(path, roles, time_scale=1e-3)
-    found = read_recording(path, roles, scale=1.02)  # of a calibration
+    found = read_recording(path, roles, scale=1.02)  # from a calibration
     np.testing.assert_allclose(found.omega[0], [0.102, 0.204, 0.306], rtol=1e-14)
     with pytest.raises(ValueError, match="is to be wx and wy"):
         read_recording(path, roles | {"wy": roles["wx"]})

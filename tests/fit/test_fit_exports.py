@@ -22,7 +22,7 @@ DRAG, NOISE, TIMES = np.array([0.1, 0.05, 0.2]), 0.01, np.linspace(0.0, 8.0, 25)
 
 @pytest.fixture(scope="module")
 def of_scene():
-    """Moments and drag, whose common size the rates do not show."""
+    """Moments and drag, whose common scale the rates do not determine."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping(DRAG))
     path = ph.simulate(scene, STATE, TIMES).omega_body
     rates = path + NOISE * jax.random.normal(jax.random.key(3), path.shape)
@@ -73,7 +73,7 @@ def test_ratios_are_known_where_only_a_common_factor_is_not(of_scene):
 
 
 def test_residuals_of_readings_are_those_of_the_fit(of_inertia):
-    """Also where a calibrated bias stands between readings and rates, in figures too."""
+    """Also, and in figures, if a calibrated bias relates readings to rates."""
     times, bias = np.linspace(0.0, 20.0, 60), np.array([0.3, -0.2, 0.1])
     rates = ph.simulate(ph.Scene(BODY), STATE, times).omega_body
     rates = rates + NOISE * jax.random.normal(jax.random.key(1), rates.shape)
@@ -113,7 +113,7 @@ def test_the_result_as_json_and_csv(of_scene, of_inertia, tmp_path):
     assert document["scale_known"] is False
     assert document["moments_std"] == [None] * 3
     assert {"inertia", "moments", "ratios", "gain"} <= {r["name"] for r in rows}
-    # what the data do not show has no standard deviation
+    # no finite standard deviation for what the data do not determine
     assert all(r["std"] == "" for r in rows if r["name"] == "moments")
 
 
@@ -125,7 +125,7 @@ def test_what_limits_a_fit_is_said(of_scene, of_inertia):
     part = of_inertia._calibration_part(0)
     assert of_inertia.limit().startswith(f"the calibration of the gyroscope ({part:.0%}")
     assert 0.5 < part <= 1
-    # with the covariance of an exact calibration the noise does
+    # with an exact calibration the noise limits it
     matrix = np.array(of_inertia.covariance)
     own, gain = slice(0, 6), slice(6, 15)
     side = matrix[own, gain]

@@ -55,8 +55,9 @@ OPTIONS = FitOptions(gyroscope=Gyroscope.ideal())
 
 
 def fitted(times, rates):
-    """Fits of eight recordings at once, put together: the program of all 200 compiles for three
-    times as long."""
+    """Fits in groups of eight recordings, concatenated: the program for all 200 would take three
+    times as long to compile.
+    """
     noise = SIGMA[:, None, None]
     parts = [
         fit_inertia(
@@ -72,7 +73,7 @@ def fits(cases):
     return fitted(cases[0], cases[2])
 
 
-@pytest.mark.slow  # eight at once: above
+@pytest.mark.slow  # faster: eight at once, above
 def test_recordings_fitted_at_once_have_the_fits_of_parts(cases, fits):
     noise = SIGMA[:, None, None]
     found = fit_inertia(cases[0], cases[2], omega_noise=noise, options=OPTIONS, throw=False)
@@ -92,14 +93,14 @@ def test_every_fit_converges(fits):
 
 
 def test_errors_are_as_large_as_the_bound_says(fits, cases):
-    """Errors of all six entries at once, in the metric of the information about them."""
+    """Errors of all six entries together, in the metric of their information."""
     information = np.asarray(fits.information)
     inner = np.linalg.solve(information[:, 6:, 6:], information[:, 6:, :6])
     marginal = information[:, :6, :6] - information[:, :6, 6:] @ inner
     truth = cases[4] / np.linalg.eigvalsh(cases[4])[:, 2, None, None]
     error = entries(np.asarray(fits.inertia.tensor)) - entries(truth)
     square = np.einsum("ni,nij,nj->n", error, marginal, error)
-    # a body that its motion hardly shows has a valley longer than the linear theory of it holds
+    # linear theory is not valid for bodies that their motion hardly determines
     told = np.asarray(fits.diagnostics) & int(Finding.WEAK | Finding.NEARLY_FLAT) == 0
     assert told.mean() > 0.95
     # five directions are determined, the sixth is the scale
@@ -155,7 +156,7 @@ def test_what_a_fit_of_an_inertia_lacks_is_named(fits, name, message):
 def test_values_are_the_tensor_and_start_at_the_initial_rates(fits, cases):
     np.testing.assert_array_equal(fits.values[0], fits.inertia.tensor)
     assert len(fits.values) == len(fits.std) == 1
-    assert np.all(np.isinf(fits.std[0]).any(axis=(1, 2)))  # the scale does not show
+    assert np.all(np.isinf(fits.std[0]).any(axis=(1, 2)))  # the scale is not determined
     assert fits.sensor == fits.sensor_std == {}
     np.testing.assert_allclose(fits.initial.omega_body[:, 0], cases[1][:, 0], atol=0.3)
     assert fits.initial.wxyz.shape == (BODIES, 1, 4)
@@ -167,7 +168,7 @@ def test_the_scale_is_reported_as_unknown(fits):
     assert np.mean(np.asarray(fits.null_count) == 1) > 0.97
     np.testing.assert_allclose(fits.moments[:, 2], 1, rtol=1e-12)
     assert np.all(np.isinf(fits.moments_std))
-    # the tensor itself is the direction that changes nothing
+    # the tensor itself is the null direction
     tensor, information = np.asarray(fits.inertia.tensor), np.asarray(fits.information)
     change = np.einsum("nij,nj->ni", information[:, :6, :6], entries(tensor))
     assert np.abs(change).max() < 1e-8 * np.abs(information[:, :6, :6]).max()
@@ -241,9 +242,9 @@ def test_recordings_of_different_length_stack():
     np.testing.assert_array_equal(both.present, [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
 
 
-@pytest.mark.slow  # gaps: test_gaps_are_left_out
+@pytest.mark.slow  # faster: gaps, test_gaps_are_left_out
 def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
-    """Nor do readings of no noise at all count as far from it."""
+    """And readings without any noise do not count as far from it."""
     times, clean, noisy, *_ = cases
     holed = np.stack([noisy[2], noisy[4], np.broadcast_to(clean[0, :1], clean[0].shape)])
     holed[:2, ::5] = np.nan

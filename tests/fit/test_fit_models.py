@@ -1,4 +1,4 @@
-"""Fits beyond plain free flight: a wheel and drag, biased and turned sensors, outliers, float32."""
+"""Fits beyond free flight: wheel and drag, biased and rotated sensors, outliers, float32."""
 
 import importlib.util
 import warnings
@@ -71,7 +71,7 @@ def flight(times, omega, *, wheel=None, drag=(0.0, 0.0)):
     return y[:, :4], (y[:, 4:] - carried) @ inverse.T
 
 
-@pytest.mark.slow  # derivatives of the residuals: below
+@pytest.mark.slow  # faster: derivatives of the residuals, below
 def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     rng = np.random.default_rng(3)
     times = np.linspace(0, 2, 401)
@@ -102,7 +102,7 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     off = (np.asarray(fit.moments) - moments) / np.asarray(fit.moments_std)
     assert np.abs(off).max() < 4
     assert np.max(np.asarray(fit.moments_std) / moments) < 0.01
-    # after the tensor: drag's two numbers and the delay, in the order of their names
+    # after the tensor: two drag coefficients and the delay, by name
     spread = np.sqrt(np.diagonal(np.asarray(fit.covariance)))[6:9]
     found = fit.parameters.motion
     known = np.array([delay, 0.05, 0.02])
@@ -117,9 +117,9 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     assert 0.9 < float(fit.noise) < 1.1
 
 
-@pytest.mark.slow  # fit_scene's tests are a small one
+@pytest.mark.slow  # faster: the tests of fit_scene
 def test_any_scene_may_be_the_model():
-    """A known torque shows the scale; the damping is fitted."""
+    """A known torque determines the scale; the damping is fitted."""
     rng = np.random.default_rng(6)
     times = np.linspace(0, 3, 61)
     torque = np.array([1.0, -2.0, 1.5])
@@ -164,7 +164,7 @@ SENSOR = {"bias": np.array([0.3, -0.2, 0.1]), "turn": np.array([0.1, -0.15, 0.2]
 
 
 def sensed(times, *, flip=(1, 1, 1), outliers=0):
-    """A biased gyroscope turned against the body, attitudes, an accelerometer on a lever arm."""
+    """Readings of a biased and rotated gyroscope, attitudes, an accelerometer on a lever arm."""
     rng = np.random.default_rng(8)
     wxyz, omega = flight(times, np.array([2.56, 1.82, 1.91]))
     slope = np.linalg.solve(TENSOR, np.cross(omega @ TENSOR, omega).T).T
@@ -241,8 +241,9 @@ def test_the_bias_to_start_from_is_that_beside_the_attitudes():
 
 @pytest.mark.slow
 def test_a_bias_of_twice_the_rates_and_flat_bodies_are_no_traps():
-    """The fit starts from the bias that attitudes show, and does not end with a flat body that
-    explains the readings less well than another (the last one)."""
+    """The fit starts from the bias that the attitudes imply, and does not end with a flat body that
+    explains the readings worse than another body (the last case).
+    """
     times, rates, wxyz, bias, ratio = biased_prolate_bodies([1, 3, 5, 7, 13, 26])
     data = {"omega_noise": 0.02, "attitude_noise": 0.01, "options": FitOptions(bias=True)}
     fit = fit_inertia(times, rates, wxyz=wxyz, **data)
@@ -308,7 +309,7 @@ def test_windows_of_a_long_recording_stored_in_single_precision():
 
 
 def reference():
-    """The series of many digits of tests/free."""
+    """The multiple-precision series of tests/free."""
     path = Path(__file__).parents[1] / "free" / "reference_free.py"
     found = importlib.util.spec_from_file_location("reference_free", path)
     module = importlib.util.module_from_spec(found)
@@ -340,9 +341,9 @@ def test_gradient_of_the_residuals_against_30_digits():
     unit = float(base.soft) / 5e-3
 
     def truth(y):
-        """The same residuals, everything by mpmath."""
+        """The same residuals, computed entirely by mpmath."""
         with mp.workdps(30), warnings.catch_warnings():
-            # newer mpmath announces another order of coefficients
+            # newer versions of mpmath warn of another order of coefficients
             warnings.simplefilter("ignore", DeprecationWarning)
             e = [mp.mpf(float(b)) + mp.mpf(unit) * x for b, x in zip(base.entries, y[:6])]
             a, b, c, p, q, r = e
@@ -380,7 +381,7 @@ def test_a_loss_needs_a_positive_threshold(threshold):
         Huber(threshold)
 
 
-@pytest.mark.slow  # the inverse alone: test_the_loss_of_large_residuals_has_an_inverse
+@pytest.mark.slow  # faster: the inverse alone, test_the_loss_of_large_residuals_has_an_inverse
 def test_residuals_of_outliers_are_reported_as_measured():
     times = np.linspace(0, 8, 161)
     state = ph.State([1.0, 0, 0, 0], [0.3, 1.0, 0.6])

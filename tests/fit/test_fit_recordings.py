@@ -1,4 +1,4 @@
-"""Fits of real tosses (skipped where the recordings are absent): known answers, named traps."""
+"""Fits of real tosses with known results and known pitfalls (skipped without the recordings)."""
 
 import csv
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_tosses_of_a_racquet_together():
     ratios = np.asarray(fit.ratios)
     np.testing.assert_allclose(ratios, [0.066, 0.935, 1], atol=0.006)
     assert float(fit.rms) <= 0.31
-    # half a turn of the racquet about its long axis: the time between changes of sign
+    # time between sign changes: half a turn of the racquet about its long axis
     middle = np.asarray(wxyz_to_matrix(fit.axes))[:, 1]
     residuals = np.asarray(fit.residuals["omega"])
     apart = []
@@ -64,14 +64,14 @@ def crossings(times, x):
 @pytest.mark.skipif(not PISA.exists(), reason="needs ../shared/data/pisa_racket")
 @pytest.mark.slow
 def test_a_toss_recorded_with_left_handed_axes():
-    """The author's fit, made with the mended sign, is 18(5) : 19(5) : 1."""
+    """The author's fit, with the corrected sign, is 18(5) : 19(5) : 1."""
     table = np.loadtxt(PISA)
     fit = fit_inertia(table[:, 0], table[:, 1:4], throw=False)
     assert "step limit" not in fit.findings()
     ratios = np.asarray(fit.ratios)
     assert np.all(ratios > 0)
     assert ratios[0] + ratios[1] >= 1
-    # as recorded a plausible body, but not a racket; the twin that the report names is the racket
+    # a possible body, but not a racquet; the mirror body that the report names is the racquet
     assert ratios[0] > 0.15
     twin = np.sort(np.asarray(fit.mirror_inertia.moments))
     np.testing.assert_allclose(twin / twin[0], [1, 18, 19], atol=5)
@@ -106,7 +106,7 @@ def test_gaps_of_the_wheel_are_bridged_and_remembered():
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [{"attitude_noise": 0.03}, {}])
 def test_noisy_attitudes_alone_give_the_body(given):
-    """Their differences start the search so far off that the first starts meet in local minima."""
+    """Their differences start the search so far away that it first reaches local minima."""
     moments, times = np.array([1.0, 1.6, 2.2]), np.linspace(0, 8, 201)
     state = ph.State([0.6, 0.3, -0.2, 0.7], [0.6, 2.0, 0.8])
     wxyz = ph.simulate(ph.Scene(ph.Inertia.from_moments(moments)), state, times).wxyz

@@ -1,4 +1,4 @@
-"""``fit_scene``: drag, wheels, gravity, orbits from recordings, and how well they are known."""
+"""``fit_scene``: drag, wheels, gravity and orbits from recordings, and their uncertainty."""
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +24,14 @@ TIMES = np.linspace(0.0, 8.0, 25)
 
 
 def damped(rates):
-    """Rates of a body with that drag, as 240 recordings."""
+    """Rates of a body with this drag, as 240 recordings."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping(TRUE_DRAG))
     path = ph.simulate(scene, ph.State(STATE.wxyz, rates), TIMES).omega_body
     return np.broadcast_to(path, (240, 25, 3))
 
 
 def drag_of(rates, throw=True):
-    """The drag that such recordings show, all in one program."""
+    """The drag fitted to such recordings, all in one program."""
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
     start = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
     free = lambda s: [s.torque.c]  # noqa: E731
@@ -41,13 +41,13 @@ def drag_of(rates, throw=True):
 
 @pytest.fixture(scope="module")
 def found():
-    """240 draws of the noise."""
+    """Fits of 240 draws of the noise."""
     return drag_of(noisy(1, damped(STATE.omega_body)))
 
 
 @pytest.mark.slow
 def test_intervals_of_a_drag_hold_the_truth(found):
-    """Normal deviates, of the stated size."""
+    """Errors are normal deviates of the stated size."""
     true = TRUE_DRAG
     assert found.values[0].shape == found.std[0].shape == (240, 3)
     off = (np.asarray(found.values[0]) - true) / np.asarray(found.std[0])
@@ -114,7 +114,7 @@ def test_whatever_a_scene_holds():
 
 @pytest.mark.slow
 def test_what_the_data_cannot_show_is_said():
-    """The drag about two axes that the body does not turn about."""
+    """The drag about two axes about which the body does not rotate."""
     found = drag_of(damped([0.0, 0.0, 1.0]), throw=False)
     assert found.findings() == ["undetermined"]
     assert np.all(np.asarray(found.null_count) == 2)
@@ -153,7 +153,7 @@ def test_refused_scenes_and_data():
         ph.fit_scene(several, data, lambda s: [s.torque.c])
 
 
-@pytest.mark.slow  # a fitted scene: test_fit_exports
+@pytest.mark.slow  # faster: a fitted scene, test_fit_exports
 def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
     # the drag, then the initial rates
     spread = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
@@ -196,9 +196,9 @@ def test_the_bias_and_the_model_of_a_fitted_scene():
     np.testing.assert_allclose(predicted[0], again, atol=1e-6)
 
 
-@pytest.mark.slow  # transformations of bounded values: below
+@pytest.mark.slow  # faster: transformations of bounded values, below
 def test_bounds_and_priors_hold():
-    """A coefficient that is zero, bounded by zero; one with a prior narrower than the data."""
+    """A coefficient that is zero, bounded by zero; another with a prior narrower than the data."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.06, 0.0]))
     rates = noisy(4, ph.simulate(scene, STATE, TIMES).omega_body)
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
@@ -229,7 +229,7 @@ def test_bounds_and_priors_hold():
     assert "the prior" in fit.limit()
 
 
-@pytest.mark.slow  # 25 s of compilation: test_bounds_and_priors_hold
+@pytest.mark.slow  # 25 s of compilation; faster: test_bounds_and_priors_hold
 def test_optima_at_a_bound_are_found():
     """Of a body without quadratic drag half of the coefficients end at zero, each of 8 recordings
     in fewer steps than the limit."""
@@ -256,7 +256,9 @@ def test_optima_at_a_bound_are_found():
 
 
 def test_values_between_bounds_and_numbers_that_may_be_anything():
-    """Both ways, for two bounds, one and none; derivatives do not vanish far beyond a bound."""
+    """The transformation and its inverse for two bounds, one and none; derivatives do not vanish
+    far beyond a bound.
+    """
     scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.2, 0.3]))
     low, high = jnp.array([0.0, 0.0, -jnp.inf]), jnp.array([0.15, jnp.inf, 0.4])
     motion = LeafMotion(scene, places_of(scene, lambda s: s.torque.c), bounds=((low, high),))

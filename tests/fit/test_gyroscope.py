@@ -27,8 +27,9 @@ KEY = jax.random.key(3)
 
 
 def allan_variance(readings, counts):
-    """Allan variances of averages over ``counts`` samples, from one sample to the next (IEEE Std
-    952-1997, annex C: half the mean square of differences of successive averages)."""
+    """Allan variances of averages over ``counts`` samples, for all starting samples (IEEE Std
+    952-1997, annex C: half the mean square of differences of successive averages).
+    """
     found = []
     for count in counts:
         size = len(readings) // count
@@ -51,7 +52,7 @@ def test_simulated_noise_has_the_allan_variance_of_its_densities():
     ):
         readings = np.asarray(sensor.read(KEY, times, still))
         found = np.mean([allan_variance(readings[:, k], counts) for k in range(3)], axis=0)
-        # a walk within an average of few samples is one of steps: 1 + 1 / (2 count^2)
+        # within an average of few samples a random walk is discrete: 1 + 1 / (2 count^2)
         share = walk**2 * tau / 3 * (sensor.bias_walk > 0)
         expected = expected + share / (2 * counts**2)
         # averages of 256 samples: 3 * 234 of them, a standard error of about 6 %
@@ -78,7 +79,7 @@ def test_readings_are_those_of_the_fields():
 
 
 def test_a_delayed_gyroscope_fits_its_own_motion():
-    """Residuals vanish to the third order in the delay, as of ``Gyroscope.read``."""
+    """Residuals vanish to third order in the delay, as in ``Gyroscope.read``."""
     delay = 0.013
 
     def rates(t):
@@ -186,7 +187,7 @@ def with_errors(omega, std, seed=0):
 
 @pytest.mark.slow
 def test_intervals_hold_with_errors_of_scale_and_misalignment():
-    """One per cent of each, 60 bodies; taken as exact they leave intervals that hold nothing."""
+    """One per cent of each, 60 bodies; treated as exact, their intervals miss the truth."""
     ratios, omega, _ = bodies(60)
     data = Gyroscope(noise_density=0.002).read(KEY, TIMES, with_errors(omega, 0.01))[:, ::4]
     times = TIMES[::4]
@@ -206,7 +207,7 @@ def test_intervals_hold_with_errors_of_scale_and_misalignment():
 
 @pytest.mark.slow
 def test_errors_of_scale_and_misalignment_do_not_leave_residuals():
-    """A few bodies; ``noise`` unknown, so that the prior is weighed by that of the residuals."""
+    """Few bodies; ``noise`` is not stated, so the residuals' noise weights the prior."""
     ratios, omega, _ = bodies(4)
     data = Gyroscope(noise_density=0.002).read(KEY, TIMES, with_errors(omega, 0.01))
     fit = fit_inertia(TIMES[::4], data[:, ::4])
@@ -222,13 +223,13 @@ def test_errors_of_scale_and_misalignment_do_not_leave_residuals():
 
 @pytest.mark.slow
 def test_two_of_three_scale_factors_of_a_free_body_leave_no_residuals():
-    """Stretched along principal axes, free rates are those of another free body, to rounding."""
+    """Free rates stretched along principal axes are those of another free body, to rounding."""
     moments = np.array([1.0, 1.6, 2.2])
     scene = ph.Scene(ph.Inertia.from_moments(moments))
     rates = np.asarray(
         ph.simulate(scene, ph.State([1.0, 0, 0, 0], [2.0, 3.0, -1.5]), TIMES).omega_body
     )
-    # Euler's equations with s_i omega_i: the coefficients of their products become these
+    # coefficients of Euler's equations for s_i omega_i
     coefficient = np.array(
         [(moments[(k + 1) % 3] - moments[(k + 2) % 3]) / moments[k] for k in range(3)]
     )
@@ -236,7 +237,7 @@ def test_two_of_three_scale_factors_of_a_free_body_leave_no_residuals():
     def constraint(last):
         s = np.array([1.004, 0.998, last])
         a = coefficient * s / (np.roll(s, -1) * np.roll(s, 1))
-        return a.sum() + a.prod(), s  # zero for the coefficients of a body
+        return a.sum() + a.prod(), s  # zero if the coefficients are those of a body
 
     low, high = 0.9, 1.1
     for _ in range(60):
@@ -266,7 +267,7 @@ def test_readings_at_a_limit_count_as_bounds():
     )
     codes = np.asarray(fit.diagnostics)
     assert np.all(codes & int(Finding.SATURATED) > 0)
-    # what cannot be found so says so
+    # failures are reported
     sound = codes & int(Finding.POOR | Finding.UNDETERMINED | Finding.STEP_LIMIT) == 0
     assert sound.sum() >= 4
     assert np.all(np.abs(deviations(fit, ratios))[sound] < 4)
@@ -275,7 +276,7 @@ def test_readings_at_a_limit_count_as_bounds():
 
 @pytest.mark.slow
 def test_a_saturated_reading_is_a_bound_beside_errors_of_scale():
-    """The limit is found by itself; a residual at it is zero while the model is beyond it."""
+    """The limit is detected; a residual at it is zero while the model exceeds the limit."""
     ratios, omega, _ = bodies(1)
     noisy = with_errors(omega, 0.01)[:, ::4]
     noisy = noisy + 0.02 * np.random.default_rng(2).normal(size=noisy.shape)
@@ -323,8 +324,9 @@ def test_a_delay_of_the_gyroscope_shows_beside_attitudes():
 
 @pytest.mark.slow
 def test_deviations_are_those_of_readings():
-    """``sensor`` gives bias and gain in readings, so does ``sensor_std``, and ``bias_std`` is one
-    of readings."""
+    """``sensor`` has bias and gain in terms of readings, and so have ``sensor_std`` and
+    ``bias_std``.
+    """
     _, omega, _ = bodies(1)
     std = {}
     for size in (1.0, 2.0):
@@ -337,7 +339,7 @@ def test_deviations_are_those_of_readings():
         options = FitOptions(gyroscope=Gyroscope(gain), bias=True, trust_noise=True)
         fit = fit_recordings([recording], options=options)
         std[size] = fit.sensor_std
-    # half of what the readings show
+    # half of the readings' size
     prior = 0.5 * float(std[2.0]["bias"][1])
     options = FitOptions(gyroscope=Gyroscope(gain, bias_std=prior), trust_noise=True)
     known = fit_recordings([recording], options=options)
@@ -350,9 +352,9 @@ def test_deviations_are_those_of_readings():
     )
 
 
-@pytest.mark.slow  # a fit with the usual sensor model: test_fit_exports
+@pytest.mark.slow  # faster: a fit with the usual sensor model, test_fit_exports
 def test_calibrated_readings_are_corrected():
-    """``gain`` and ``bias`` as calibrated: the fit is that of the rates, ``sensor`` has both."""
+    """With calibrated ``gain`` and ``bias`` the fit is that of true rates; ``sensor`` has both."""
     _, omega, _ = bodies(1)
     gain = np.array([[1.05, 0.02, 0.0], [0.0, 0.93, 0.04], [-0.03, 0.0, 1.0]])
     sensor = Gyroscope(gain, [0.3, -0.2, 0.1], noise_density=0.002)
@@ -371,7 +373,7 @@ def test_calibrated_readings_are_corrected():
     assert float(fit.noise) == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.slow  # a fit with the usual sensor model: test_fit_exports
+@pytest.mark.slow  # faster: a fit with the usual sensor model, test_fit_exports
 def test_the_table_names_what_shows_it():
     """Rates alone: no size, no rotation of the sensor, two scale factors only by calibration."""
     _, omega, _ = bodies(1)

@@ -1,4 +1,4 @@
-"""Displays of document 003 that no other test states, with the corrections of the errata."""
+"""Formulas of document 003 that no other test covers, with the corrected misprints."""
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,13 @@ def attitude(t):
 
 
 def hat(vector):
-    """The matrix of a cross product, [hat(a)] b = a x b (displays 11, 23)."""
+    """The matrix of a cross product, [hat(a)] b = a x b (formulas 11, 23)."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def turning():
-    """R, its derivative, and the angular velocity of the frame."""
+    """R, its derivative, and the angular velocity of a frame."""
     t = jnp.asarray(TIME)
     matrix, slope = jax.jvp(attitude, (t,), (jnp.ones_like(t),))
     frame = RotatingFrame.from_attitude(attitude)
@@ -35,7 +35,7 @@ def turning():
 
 
 def test_rotation_matrices_are_orthogonal():
-    """Displays 1, 2: R^T R = R R^T = 1, lengths and angles kept, det R = +1."""
+    """Formulas 1, 2: R^T R = R R^T = 1, lengths and angles preserved, det R = +1."""
     rng = np.random.default_rng(2)
     wxyz = rotation.normalise(jnp.asarray(rng.normal(size=(50, 4))))
     matrix = np.asarray(rotation.wxyz_to_matrix(wxyz))
@@ -49,7 +49,7 @@ def test_rotation_matrices_are_orthogonal():
 
 
 def test_omega_is_the_antisymmetric_matrix_of_the_frame():
-    """Displays 5-12: R^T dR/dt = -(dR/dt)^T R = hat(omega), the sum of three generators."""
+    """Formulas 5-12: R^T dR/dt = -(dR/dt)^T R = hat(omega), the sum of three generators."""
     matrix, slope, omega = turning()
     turn = matrix.T @ slope
     np.testing.assert_allclose(turn, -turn.T, atol=1e-15)
@@ -60,7 +60,7 @@ def test_omega_is_the_antisymmetric_matrix_of_the_frame():
 
 
 def test_omega_acts_on_frame_components():
-    """Display 11, corrected: Omega x_frame is a velocity, Omega x_space is none."""
+    """Formula 11, corrected: Omega x_frame is a velocity, Omega x_space is not."""
     matrix, slope, omega = turning()
     frame = RotatingFrame.from_attitude(attitude)
     at = np.array([1.0, -2.0, 0.5])
@@ -75,7 +75,7 @@ def test_omega_acts_on_frame_components():
 
 
 def test_small_steps_turn_about_body_axes():
-    """Displays 13-16: R(t + h) = R(t)(1 + Omega h) + O(h^2), three small turns in any order."""
+    """Formulas 13-16: R(t + h) = R(t)(1 + Omega h) + O(h^2), three small rotations in any order."""
     matrix, _, omega = turning()
     small = []
     for h in (1e-3, 1e-4):
@@ -94,7 +94,7 @@ def test_small_steps_turn_about_body_axes():
 
 
 def test_momentum_of_a_moving_particle_has_a_second_part():
-    """Display 22, corrected: R^T L_space = m x cross v + I omega; I omega alone at rest."""
+    """Formula 22, corrected: R^T L_space = m x cross v + I omega; I omega alone at rest."""
     matrix, _, omega = turning()
     frame, mass, at = RotatingFrame.from_attitude(attitude), 2.0, np.array([1.0, -2.0, 0.5])
     tensor = np.asarray(MassProperties.from_points([mass, mass], [at, -at]).central.tensor) / 2
@@ -107,7 +107,7 @@ def test_momentum_of_a_moving_particle_has_a_second_part():
 
 
 def test_tensor_of_a_particle_is_minus_m_x_squared():
-    """Displays 23-26: I = -m X X, in indices, and the triple product it comes from."""
+    """Formulas 23-26: I = -m X X, in indices, and the triple product from which it follows."""
     mass, at, omega = 2.0, np.array([1.0, -2.0, 0.5]), np.array([0.3, -0.5, 0.7])
     pair = MassProperties.from_points([mass, mass], [at, -at])
     tensor = np.asarray(pair.central.tensor) / 2
@@ -125,7 +125,7 @@ def test_tensor_of_a_particle_is_minus_m_x_squared():
 
 
 def test_torque_is_the_rate_of_momentum_in_space():
-    """Displays 27, 28: dL/dt = N in inertial axes, for a free and for a driven body."""
+    """Formulas 27, 28: dL/dt = N in inertial axes, for a free and for a driven body."""
     inertia = Inertia.from_tensor(
         [[1.008, 0.039, 0.22], [0.039, 1.211, 0.234], [0.22, 0.234, 0.793]]
     )

@@ -14,7 +14,7 @@ decades = st.floats(-3, 3)
 
 @eqx.filter_jit
 def motions(omega, wxyz, t, inner):
-    """The motion of a particle in a frame, in space, and again in the frame."""
+    """Motion of a particle in the frame, in space, and transformed back to the frame."""
     frame = ph.RotatingFrame.from_rate(omega, wxyz=wxyz)
     position = frame.position_to_space(t, inner[0])
     velocity = frame.velocity_to_space(t, *inner[:2])
@@ -35,7 +35,7 @@ def test_motions_to_space_and_back(dtype, axis, decade, position, velocity, acce
     rate = 10.0**decade
     omega = np.array(axis) / np.linalg.norm(axis) * rate
     inner = [np.array(x, float) for x in (position, velocity, acceleration)]
-    inner = [x * rate**order for order, x in enumerate(inner)]  # of one angle turned
+    inner = [x * rate**order for order, x in enumerate(inner)]  # rates per angle of rotation
     given_ = [jnp.asarray(x, dtype) for x in (omega, [0.5, -0.5, 0.1, 0.7], t / rate)]
     space, back = motions(*given_, [jnp.asarray(x, dtype) for x in inner])
     size = 1 + max(np.linalg.norm(x) / rate**order for order, x in enumerate(inner))
@@ -45,7 +45,7 @@ def test_motions_to_space_and_back(dtype, axis, decade, position, velocity, acce
     np.testing.assert_allclose(
         np.linalg.norm(space[0]), np.linalg.norm(inner[0]), rtol=8 * np.finfo(dtype).eps
     )
-    # the velocity in space is that in the frame and omega x r, of which both are rotated
+    # velocity in space: that in the frame plus omega x r, both rotated
     carried = inner[1] + np.cross(omega, inner[0])
     np.testing.assert_allclose(
         np.linalg.norm(space[1]),
@@ -64,7 +64,7 @@ def local_vertical(frame, wxyz, omega, t):
 @settings(max_examples=40, deadline=None)
 @given(decades, st.tuples(*[st.integers(-3, 3)] * 4).filter(any), vectors, st.floats(0, 6))
 def test_attitudes_to_the_orbit_frame_and_back(decade, wxyz, omega, anomaly):
-    """Of orbits from 1e-3 to 1e3 of one size, whose rates are scaled with them."""
+    """Orbits of sizes from 1e-3 to 1e3, with rates scaled accordingly."""
     axis = 10.0**decade
     rate = axis**-1.5
     frame = ph.LVLH(ph.KeplerOrbit(1.0, axis, 0.1, 0.5))
@@ -75,6 +75,6 @@ def test_attitudes_to_the_orbit_frame_and_back(decade, wxyz, omega, anomaly):
     np.testing.assert_allclose(back, omega, rtol=0, atol=2e-14 * rate)
     relative = ph.rotation.rotate(inside[0], inside[1]) / rate
     still = ph.rotation.rotate(inside[0], omega) / rate
-    turning = np.asarray(still - relative)  # the rate of the frame in its own axes
+    turning = np.asarray(still - relative)  # angular velocity of the frame along its axes
     assert turning[1] < -0.5
     np.testing.assert_allclose(turning[[0, 2]], 0, atol=1e-13)

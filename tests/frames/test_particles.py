@@ -1,4 +1,4 @@
-"""Particles in rotating frames against motion solved exactly elsewhere."""
+"""Particles in rotating frames against exact solutions."""
 
 import diffrax
 import equinox as eqx
@@ -24,7 +24,7 @@ def in_frame(frame, t, position_space, velocity_space):
 
 
 def test_free_particles_seen_from_a_steady_frame():
-    """Straight lines in space; a batch of shape (2, 3), one of them at rest at the origin."""
+    """Straight lines in space; a batch of shape (2, 3), one particle at rest at the origin."""
     rng = np.random.default_rng(1)
     frame = RotatingFrame.from_rate(OMEGA, wxyz=rng.normal(size=4))
     start, speed = rng.normal(size=(2, 2, 3, 3))
@@ -39,7 +39,7 @@ def test_free_particles_seen_from_a_steady_frame():
     np.testing.assert_allclose(velocity_space, still, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow  # a Kepler orbit: below
+@pytest.mark.slow  # faster: a Kepler orbit, below
 def test_free_particle_seen_from_a_varying_frame_with_accelerating_origin():
     def rate(t):
         return jnp.stack([jnp.sin(t), 0.4 * t, jnp.cos(2 * t)])
@@ -50,7 +50,7 @@ def test_free_particle_seen_from_a_varying_frame_with_accelerating_origin():
     frame = RotatingFrame.from_rate(rate, origin)
     start, speed = np.array([1.0, 2.0, -0.5]), np.array([0.3, -0.2, 0.8])
     ts = jnp.linspace(0.0, 3.0, 4)
-    # at t = 0 the axes agree with those of space, the origin rests at (1, 0, 0), the rate is z
+    # at t = 0: space axes, origin at rest at (1, 0, 0), angular velocity along z
     at = start - [1.0, 0.0, 0.0]
     paths = simulate_particles(frame, at, speed - np.cross([0.0, 0.0, 1.0], at), ts, rtol=3e-14)
     lines = start + np.asarray(ts)[:, None] * speed
@@ -97,7 +97,7 @@ def test_foucault_pendulum_turns_at_its_analytic_rate():
     frame = RotatingFrame.from_rate(omega)
 
     def suspension(t, position, velocity):
-        """Spring in the horizontal plane; cancels the centrifugal force and holds the height."""
+        """Spring in the horizontal plane; cancels the centrifugal force and fixes the height."""
         spring = -stiffness * position
         held = spring - frame.centrifugal(t, position)
         return held.at[..., 2].set(-frame.apparent_acceleration(t, position, velocity)[..., 2])
@@ -136,7 +136,7 @@ def test_falling_body_is_deflected_east_and_a_little_south():
 
 
 def test_gradient_of_a_path_against_its_closed_form():
-    """Where a free particle ends, differentiated by its start and by the frame's rate."""
+    """End of a free particle, differentiated by its start and by the rate of the frame."""
 
     def end(start, omega):
         frame = RotatingFrame.from_rate(omega)

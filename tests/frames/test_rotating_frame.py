@@ -1,4 +1,4 @@
-"""Rotating frames: published forces, transformations both ways, terms that are not computed."""
+"""Rotating frames: published forces, transformations both ways, terms that are skipped."""
 
 import equinox as eqx
 import jax
@@ -74,7 +74,7 @@ def test_forces_vanish_where_they_must():
     ],
 )
 def test_transformations_against_differentiated_paths(with_origin):
-    """x_space(t) = origin + R x(t) differentiated directly, and back again."""
+    """x_space(t) = origin + R x(t), differentiated directly, and transformed back."""
     origin = wobbling_origin if with_origin else None
     frame = RotatingFrame.from_attitude(wobbling_attitude, origin)
 
@@ -173,7 +173,7 @@ def test_bad_input_is_named(make, error, message):
 
 @pytest.mark.parametrize("t", [0.0, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_the_attitude_of_a_given_rate_has_its_derivatives_by_time(t):
-    """At the first time too, where nothing is integrated; in forward and reverse mode."""
+    """Also at the first time, where nothing is integrated; in forward and reverse mode."""
     frame = RotatingFrame.from_rate(lambda t: jnp.array([0.1, 0.2 * t, 1.0 + t]))
 
     def rate(t):
@@ -196,7 +196,7 @@ def test_the_attitude_of_a_given_rate_has_its_derivatives_by_time(t):
 
 
 def test_a_frame_of_a_motion_that_stopped_at_an_event():
-    """Its last times are that of the event, again and again."""
+    """Its last times all equal that of the event."""
     times, rate = jnp.array([0.0, 0.5, 1.0, 1.2, 1.2, 1.2]), jnp.array([0.3, 0.4, 1.2])
     turns = rotation.rotation_vector_to_wxyz(jnp.outer(times, rate))
     omega = jnp.broadcast_to(rate, (6, 3))
@@ -231,7 +231,7 @@ def test_lists_are_vectors(unchecked):
 
 @pytest.mark.parametrize("time", [0.3, 1.1])
 def test_derivative_by_the_time_of_the_start(time):
-    """At that time itself, where nothing is integrated, and later."""
+    """At that time, where nothing is integrated, and later."""
 
     def attitude(t0):
         rate = lambda t: jnp.array([0.1, 0.2, 1.0]) * (1 + t)  # noqa: E731
@@ -261,7 +261,7 @@ def test_forces_of_batches_and_no_times(rate, unchecked):
     assert frame.omega_body(jnp.zeros((2, 0), jnp.float32)).shape == (2, 0, 3)
     for times in (1, [1, 2], jnp.array([1, 2]), 1.5):
         assert frame.attitude(times).dtype == jnp.float32
-    for got in (  # of lists and integers
+    for got in (  # from lists and integers
         frame.position_to_space(1.5, [1, 2, 3]),
         frame.velocity_to_frame(1.5, [1.0, 2.0, 3.0], [1, 2, 3]),
         frame.apparent_acceleration(1.5, [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]),

@@ -1,4 +1,4 @@
-"""Frames of tumbling bodies, and the sensors fixed in them."""
+"""Frames of tumbling bodies, and sensors fixed in them."""
 
 import equinox as eqx
 import jax
@@ -47,7 +47,7 @@ def test_angular_acceleration_is_that_of_eulers_equation(tumble):
 
 
 def test_sensors_read_what_a_differentiated_path_tells(tumble):
-    """Second differences of the space path of the point, turned into body axes."""
+    """Second differences of the point's path in space, rotated into body axes."""
     np.testing.assert_array_equal(gyroscope(tumble), tumble.omega_body)
     path = np.asarray(rotation.rotate(tumble.wxyz, jnp.broadcast_to(POSITION, (321, 3))))
     step = 8.0 / 320
@@ -77,7 +77,7 @@ def test_particle_fixed_in_the_body_feels_what_its_accelerometer_reads(tumble):
 
 
 def test_interpolated_attitude_converges_with_sixth_order(tumble):
-    """Every sixteenth and every eighth sample, seen at samples left out."""
+    """Interpolated from every sixteenth and every eighth sample, compared at omitted samples."""
     errors = []
 
     @eqx.filter_jit
@@ -154,7 +154,7 @@ def test_missing_records_and_coarse_samples_are_named(tumble):
 
 
 def test_angular_acceleration_with_a_driven_wheel():
-    """Free floating about one axis: the motor's torque on the wheel acts on the body reversed."""
+    """Free rotation about one axis: the body takes the reaction of the motor's torque."""
     inertia = ph.Inertia.from_moments(jnp.array([[1.0, 1.5, 2.0], [1.0, 1.5, 2.5]]))
     wheel = ph.Rotor([0.0, 0.0, 1.0], inertia=0.25, speed=3.0, torque=0.125)
     state = ph.State([1.0, 0.0, 0.0, 0.0], jnp.array([[0.0, 0.0, 0.5]] * 2))

@@ -1,7 +1,7 @@
 """Writes free_cases.json: states and derivatives of free bodies in every regime, to 50 digits.
 
 Run by hand (``python make_free_cases.py``, some minutes) after a change of the list; delete the
-file to have every case worked out anew.
+file to compute every case again.
 """
 
 import json
@@ -22,7 +22,7 @@ def _separatrix(distance: float) -> tuple:
 
 
 def _short(values) -> list[float]:
-    """Rounded to single precision, so that the cases serve both, unless that loses its point."""
+    """Rounded to single precision, for both precisions, unless this removes the special case."""
     kept = []
     for x in values:
         y = float(np.float32(x)) if 1e-30 < abs(x) < 1e30 else float(x)

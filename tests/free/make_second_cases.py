@@ -1,7 +1,8 @@
 """Writes second_cases.json: second derivatives of free bodies along pairs of directions.
 
 Run by hand (``python make_second_cases.py``, some minutes) after a change of the list. Central
-differences of the 50-digit states of reference_free.py, step 1e-12: 24 digits are left.
+differences of the 50-digit states of reference_free.py with a step of 1e-12 are accurate to 24
+digits.
 """
 
 import json
@@ -28,7 +29,7 @@ def cases() -> list[dict]:
     found = []
 
     def add(name, moments, omega, t, products=True):
-        """``products``: False where two moments are equal or nearly so."""
+        """``products``: False if two moments are equal or nearly equal."""
         found.append(
             {"name": name, "moments": moments, "omega": omega, "t": t, "products": products}
         )
@@ -40,7 +41,7 @@ def cases() -> list[dict]:
     for power in (52, 40, 20, 10):
         near = 2.0**-power
         add(f"sphere within 2^-{power}", (1, 1 + near, 1 - near / 2), RATES, 3.0, power < 20)
-    # On either side of where a series takes over.
+    # On both sides of the threshold of a series.
     for t in (7.0, 9.0):
         add(f"sphere within 2^-10, t={t}", (1, 1 + 2.0**-10, 1 - 2.0**-11), RATES, t)
     add("oblate", (1, 1, 1.5), RATES, 3.0, False)
@@ -77,7 +78,7 @@ def state(case, change):
 
 
 def directions(case) -> list[list]:
-    """The pairs of MOVES of a case in absolute units."""
+    """The pairs of MOVES of a case, in absolute units."""
     a, b, c = case["moments"]
     units = [a, b, c, math.sqrt(a * b), math.sqrt(a * c), math.sqrt(b * c), 1, 1, 1, 1]
     kept = [

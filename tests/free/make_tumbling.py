@@ -1,9 +1,9 @@
-"""Writes the reference data of free motion that the package ships: ``polhode reference``.
+"""Writes the reference data of free motion that the package includes: ``polhode reference``.
 
-``python tests/free/make_tumbling.py`` (some minutes): in arithmetic of 150 digits by closed forms.
-``--check``: compares every number with a second method that has none of them: Taylor series of the
-equations of motion over one period of the body rates, which determines the motion at all times.
-It takes 5 minutes of one core; the largest error is 0.4999 units of the 17th digit.
+``python tests/free/make_tumbling.py`` (some minutes) computes them from closed forms in 150-digit
+arithmetic. ``--check`` compares every number with an independent method: Taylor series of the
+equations of motion over one period of the body rates, which determines the motion at all times. It
+takes 5 minutes on one core; the largest error is 0.4999 units of the 17th digit.
 """
 
 import argparse
@@ -223,11 +223,11 @@ _SLOW = 1e9
 
 
 def by_turns(moments, omega, t, step, digits: int) -> list:
-    """The same for a body of two equal moments by Taylor series over one ``step`` of many.
+    """The same for a body with two equal moments, by Taylor series over one of many equal steps.
 
-    The body rates after a step are those before it rotated by an angle about the axis of symmetry,
-    s in quaternions. The next step f' is therefore f seen from axes rotated by s, s f s^-1, and n
-    steps are f (s f s^-1) (s^2 f s^-2) ... = (f s)^n s^-n.
+    The body rates after a step are those before it, rotated by an angle about the axis of symmetry
+    (s as a quaternion). The next step f' is therefore f in rotated axes, s f s^-1, and n steps are
+    f (s f s^-1) (s^2 f s^-2) ... = (f s)^n s^-n.
     """
     (k,) = (i for i in range(3) if moments[i - 1] == moments[i - 2] != moments[i])
     i, j = (k + 1) % 3, (k + 2) % 3
@@ -268,7 +268,7 @@ def stored() -> list[dict]:
 
 
 def in_last_digits(exact, text: str) -> float:
-    """Error of a number in units of its 17th significant digit; 0.5 where it is rounded right."""
+    """Error of a number in units of its 17th significant digit; rounding allows 0.5."""
     size = max(abs(exact), mp.mpf(10) ** -30)
     return float(abs(exact - mp.mpf(text)) / mp.mpf(10) ** (mp.floor(mp.log10(size)) - 16))
 
@@ -277,7 +277,7 @@ def in_last_digits(exact, text: str) -> float:
 def difference(row: dict, sample: dict, derivative: bool, digits: int = 50) -> float:
     """Largest error of the numbers of one sample in units of their 17th digits.
 
-    ``row``, ``sample``: of ``stored``; ``derivative``: whether to check the derivatives too.
+    ``row``, ``sample``: from ``stored``; ``derivative``: whether to check the derivatives too.
     """
     moments, omega = ([float(x) for x in row[key]] for key in ("moments", "omega_body"))
     t = float(sample["t"])

@@ -4,8 +4,8 @@ High-order Taylor series of Euler's equations and of the quaternion,
 
     dL/dt = L x w,   dq/dt = q (0, w) / 2,   w = I^-1 L,
 
-with the step taken from the last coefficients. Every regime is the same to it. Derivatives are
-central differences of these 50-digit solutions, which leaves 30 good digits.
+with a step that follows from the last coefficients. No regime is special for this method.
+Derivatives are central differences of these 50-digit solutions, accurate to 30 digits.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from operator import mul
 import mpmath as mp
 
 DIGITS = 50
-_GUARD = 15  # digits more that the sums carry
+_GUARD = 15  # guard digits of the sums
 
 
 def _tensor(moments, products):
@@ -33,9 +33,9 @@ def _product(a, b, n, bits):
 
 
 def _step(q, momentum, inverse, left, digits):
-    """One Taylor step of at most ``left``; returns the new state and the step taken.
+    """One Taylor step of at most ``left``; returns the new state and the step.
 
-    Momenta in units of the largest, time in units of the present rate, all in fixed point.
+    Momenta are in units of the largest, time in units of the present rate, all in fixed point.
     """
     bits, order = ceil((digits + _GUARD) * log2(10)), ceil(1.15 * digits)
     size = max(abs(x) for x in momentum)
@@ -63,7 +63,7 @@ def _step(q, momentum, inverse, left, digits):
             Q[i].append(slopes[i] // (2 * (n + 1)))
     rows = [[mp.ldexp(mp.mpf(x), -bits) for x in row] for row in Q + L]
     largest = max(abs(row[n]) for row in rows for n in (order - 1, order))
-    # At most a radian, so that the last bits of the coefficients are not blown up.
+    # At most a radian, to limit the growth of rounding errors of the coefficients.
     step = min(abs(left) * rate, mp.mpf(1))
     if largest > 0:
         step = min(step, (mp.mpf(10) ** -digits / largest) ** (mp.mpf(1) / order))
@@ -83,8 +83,8 @@ def free_reference(
 ) -> tuple[list, list]:
     """Attitude and body rates at time t, as mpmath numbers.
 
-    The inputs are taken as exact (floats, mpmath numbers or strings); ``products`` are the entries
-    xy, xz, yz of the inertia tensor. The attitude is normalised first.
+    The inputs are treated as exact (floats, mpmath numbers or strings); ``products`` are the
+    entries xy, xz, yz of the inertia tensor. The attitude is normalised first.
     """
     with mp.workdps(digits + 10):
         tensor = _tensor(moments, products)

@@ -1,4 +1,4 @@
-"""The formulas of docs/free_motion.md against quadrature, in 30 digits, without the library."""
+"""The formulas of docs/free_motion.md against quadrature in 30 digits, without the package."""
 
 import mpmath as mp
 import pytest
@@ -42,7 +42,7 @@ def test_the_angle_about_the_momentum(moments, start):
             half = mp.quad(rate, [0, t / 2, t]) / 2
             gap = half - (slow * t - sigma * arg(mean * frequency * t))
             assert abs(gap - mp.pi * mp.nint(gap / mp.pi)) < mp.mpf(10) ** -15
-        # the least rotation lags behind Euler's angle by none or one turn in each period of L
+        # the smallest rotation differs from Euler's angle by zero or one turn in each period of L
         euler = length * (d3 + sigma * s * mp.ellippi(-p / r, m) / K)
         turns = (2 * slow - euler) * 4 * K / frequency / (2 * mp.pi)
         assert abs(turns - mp.nint(turns)) < mp.mpf(10) ** -15

@@ -45,7 +45,7 @@ def periods(x, base):
 
 @functools.cache
 def programs(function, inner):
-    """First derivatives, and second ones."""
+    """Programs of first and second derivatives."""
     return jax.jit(jax.jacfwd(function)), jax.jit(jax.jacfwd(inner(function)))
 
 
@@ -70,7 +70,7 @@ BODIES = {
 
 
 def right_or_nan(function, kind, *, turned, inner=jax.jacfwd, tolerance=1e-6):
-    """Second derivatives, of which those that are finite agree with differences."""
+    """Finite second derivatives must agree with differences; the others are NaN."""
     base = np.diag(BODIES[kind])
     if turned:
         base = TURN @ base @ TURN.T
@@ -95,7 +95,7 @@ def test_second_derivatives_of_principal_moments_are_right_or_nan(kind, turned):
         assert np.all(np.isfinite(jax.jit(jax.jacrev(moments))(jnp.zeros(6), jnp.asarray(base))))
 
 
-@pytest.mark.slow  # of principal moments, by which those of periods are NaN: above
+@pytest.mark.slow  # faster: derivatives of principal moments, above
 @pytest.mark.parametrize("kind", BODIES)
 def test_second_derivatives_of_periods_are_right_or_nan(kind):
     if kind == "three":
@@ -120,12 +120,12 @@ def test_the_turn_of_axes_is_not_known_where_moments_agree_to_half_of_their_digi
     found = np.array([jax.jacfwd(turn)(zero)[0], jax.jacrev(turn)(zero)[0]])
     if gap < 1.5e-8:
         assert np.all(np.isnan(found))
-        assert jax.jvp(turn, (zero,), (zero,))[1] == 0  # what does not change is no matter
+        assert jax.jvp(turn, (zero,), (zero,))[1] == 0  # a zero tangent gives a zero derivative
     else:
         np.testing.assert_allclose(found, -1 / (2 * gap), rtol=1e-8)
 
 
-@pytest.mark.slow  # programs that take minutes to compile: each mode once, rates alone once
+@pytest.mark.slow  # programs compile for minutes: each mode once, only the rates once
 @pytest.mark.parametrize(
     ("function", "inner"), [(rates, jax.jacfwd), (attitude_and_rates, jax.jacrev)]
 )

@@ -1,4 +1,4 @@
-"""The exact free motion against 50-digit states and derivatives (free_cases.json), every regime."""
+"""The closed-form free motion against 50-digit states and derivatives, in every regime."""
 
 import json
 from pathlib import Path
@@ -33,13 +33,13 @@ def _fits_single(case: dict) -> bool:
     scope="module",
     params=[
         pytest.param(("float64", jax.jacfwd), id="float64"),
-        # reverse mode: test_second_derivatives, of hundreds of bodies in tests/stress, in single
+        # reverse mode: test_second_derivatives; for hundreds of bodies tests/stress; in single
         # precision in tests/systems
         pytest.param(("float32", jax.jacfwd), id="float32", marks=pytest.mark.slow),
     ],
 )
 def solved(request):
-    """States and derivatives in one mode of all cases the dtype can hold."""
+    """States and derivatives in one mode, of all cases that the dtype represents."""
     dtype, mode = request.param
     table = [c for c in CASES if dtype == "float64" or _fits_single(c)]
 
@@ -119,7 +119,7 @@ def test_initial_attitude_carries_its_derivative():
 
     slope = jax.jit(lambda q, dq: jax.jvp(attitude, (q,), (dq,)))
     _, found = slope(wxyz, jnp.asarray(change))
-    # The turn from the start is the same for every start: q(t) = q(0) p.
+    # The rotation from the start does not depend on the initial attitude: q(t) = q(0) p.
     turn = np.asarray(slope(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.asarray(change))[0])
     unit = np.asarray(wxyz) / np.linalg.norm(wxyz)
     moved = (change - unit * (unit @ change)) / np.linalg.norm(wxyz)
@@ -134,7 +134,7 @@ def _random_bodies(seed: int, count: int) -> tuple:
     return moments, *(jnp.asarray(rng.normal(size=(count, n))) for n in (4, 3))
 
 
-@pytest.mark.slow  # values: test_layouts
+@pytest.mark.slow  # faster: values, test_layouts
 def test_many_times_agree_with_single_ones_in_value_and_gradient():
     moments, wxyz, omega = _random_bodies(5, 7)
     ts = jnp.linspace(-3.0, 8.0, 4)
@@ -160,7 +160,7 @@ def test_many_times_agree_with_single_ones_in_value_and_gradient():
 
 
 def test_long_batches_are_cut_without_a_trace():
-    moments, wxyz, omega = _random_bodies(6, 16411)  # a prime: the last chunk is filled up
+    moments, wxyz, omega = _random_bodies(6, 16411)  # prime: the last chunk is padded
     t = jnp.linspace(-5.0, 5.0, 16411)
     found = MOTION(moments, wxyz, omega, t)
     whole = jax.jit(lambda *a: evaluate(prepare(*a), t))(moments, wxyz, omega)
@@ -170,7 +170,7 @@ def test_long_batches_are_cut_without_a_trace():
 
 
 def test_a_sphere_has_no_axis_that_the_momentum_may_not_be_across():
-    """Any direction of the rates, along and across every axis, turns about itself."""
+    """Any direction of the rates, along and across every axis, is a permanent rotation."""
     rates = np.array(np.meshgrid(*[(-1.0, 0.0, 0.5)] * 3)).reshape(3, -1).T
     for dtype in (np.float64, np.float32):
         omega, t = jnp.asarray(rates, dtype), jnp.full(len(rates), 1.5, dtype)
@@ -198,8 +198,9 @@ def test_a_sphere_has_no_axis_that_the_momentum_may_not_be_across():
     ],
 )
 def test_single_precision_keeps_its_digits_over_long_times(x64, over_bodies):
-    """Against double precision, 1e4 rad on; in both modes of JAX, whose transformations drop double
-    precision in one of them."""
+    """Against double precision after 1e4 rad, with and without x64: in the latter, JAX's
+    transformations drop double precision.
+    """
     rng = np.random.default_rng(7)
     moments, omega, wxyz = (rng.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4))
     moments = 1 + np.abs(moments)
@@ -223,7 +224,7 @@ def test_single_precision_keeps_its_digits_over_long_times(x64, over_bodies):
 
 
 def test_compensated_phases_next_to_the_separatrix():
-    """After a hundred thousand periods of the rates, whose length is computed in 50 digits."""
+    """After 1e5 periods of the rates, whose length is computed with 50 digits."""
     moments, omega = (1.0, 2.0, 3.0), (1.1, 0.7, 1.1 / 3**0.5 * (1 + 1e-12))
     with mp.workdps(50):
         (a, b, c), (u, v, w) = ([mp.mpf(x) for x in triple] for triple in (moments, omega))

@@ -1,4 +1,4 @@
-"""However bodies and times are cut into chunks, the motion is the same."""
+"""The motion does not depend on how bodies and times are divided into chunks."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def test_chunks_change_nothing(bodies, times, rates_only):
         )
 
     usual, small = moved(omega, None), moved(omega, 4)
-    # one body and one time at a time: no loop, no stacking of several
+    # one body and one time: no loop, no stacking
     for i, k in ((0, 1), (bodies - 1, times // 2), (bodies - 1, times - 1)):
         state = ph.State(wxyz[i], omega[i])
         alone = ph.simulate(SCENE, state, jnp.stack([ts[0], ts[k]]), record=record)

@@ -10,7 +10,7 @@ import polhode as ph
 from polhode import Mode
 from polhode._closed_forms import principal_periods
 
-# Compiled once: eager dispatch would cost far more than the numbers.
+# Compiled once: eager dispatch would take much longer than the computation.
 _periods = jax.jit(principal_periods)
 
 TOUTATIS = (3.0836, 3.235, 1.0), np.deg2rad([14.51, 33.529, -98.709])  # rad per day
@@ -27,7 +27,7 @@ def test_halley():
     """Belton et al. 1991: axisymmetric, theta 66 deg, P_phi 3.69 d, P_psi 7.1 d."""
     theta, precession, spin = np.deg2rad(66.0), 2 * np.pi / 3.69, 2 * np.pi / 7.1
     axial = precession * np.cos(theta) + spin
-    ratio = axial / (precession * np.cos(theta))  # of the greater to the least moment
+    ratio = axial / (precession * np.cos(theta))  # largest over smallest moment
     omega = jnp.array([precession * np.sin(theta), 0.0, axial])
     found = _periods(jnp.array([ratio, ratio, 1.0]), omega)
     np.testing.assert_allclose(found.P_phi, 3.69, rtol=1e-14)
@@ -39,7 +39,7 @@ def test_halley():
 
 @pytest.mark.parametrize("omega", [[0.3, 0.2, 1.0], [1.0, 0.1, 0.1]], ids=["SAM", "LAM"])
 def test_precession_of_the_short_axis(omega):
-    """Turns of the axis about the momentum, counted over whole periods of the rates."""
+    """Revolutions of the axis about the momentum, counted over whole periods of the rates."""
     body, state = ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.State([1.0, 0, 0, 0], omega)
     found = ph.periods(body, state)
     motion = ph.simulate(ph.Scene(body), state, np.linspace(0, 4 * float(found.P_psi), 401))
@@ -59,7 +59,7 @@ def test_a_plate_wobbles_twice_as_fast_as_it_spins():
 
 
 def _exact(I, w):
-    """P_psi by mpmath's K; P_phi by the mean of the long axis' precession over a period."""
+    """P_psi by mpmath's K; P_phi by the mean precession of the long axis over a period."""
     low, mid, high = sorted(range(3), key=lambda k: I[k])
     M2 = sum((a * b) ** 2 for a, b in zip(I, w, strict=True))
     E2 = sum(a * b * b for a, b in zip(I, w, strict=True))
@@ -98,7 +98,7 @@ def _by_quadrature(moments, omega, digits=30):
         ((1.0, 2.0, 3.0), (0.95, 0.3, 0.6)),
         ((1.0, 2.0, 3.0), (1.0, 0.3, 0.575)),
         ((1.0, 1.001, 0.01), (0.3, 0.2, 5.0)),
-        # a thin body far from a permanent rotation, of which the theta series converges slowest
+        # a thin body far from a permanent rotation, for which the theta series converges slowest
         (
             (0.007142514668163261, 0.8252089701268291, 0.8320578071836973),
             (140.0067128258563, 0.0, 126.43734614976562),
@@ -181,9 +181,9 @@ def _second(a, point, direction):
 
 
 @pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2)])
-@pytest.mark.slow  # of states: test_second_derivatives
+@pytest.mark.slow  # faster: derivatives of states, test_second_derivatives
 def test_second_derivatives(omega):
-    """Along a direction in moments and rates at once, against differences of 50 digits."""
+    """Along a direction in moments and rates together, against differences of 50 digits."""
     point = np.array([1.0, 2.0, 3.0, *omega])
     direction = np.array([0.25, -0.5, 0.125, 0.75, -0.25, 0.5])
 
@@ -200,7 +200,7 @@ def test_second_derivatives(omega):
 
 @pytest.mark.parametrize("off", [1e-4, -1e-9, 1e-13])
 def test_derivatives_next_to_the_separatrix(off):
-    """P_psi there is a logarithm of the distance: against 50-digit differences of 4 K / rate."""
+    """P_psi is logarithmic in the distance: against 50-digit differences of 4 K / rate."""
     moments, omega = (1.0, 2.0, 2.25), (0.75, 0.5, 1.0 + off)
 
     def exact(a, b, c, u, v, w):
@@ -245,7 +245,7 @@ def test_derivatives_are_finite_in_the_limits():
     ids=["sphere", "intermediate axis"],
 )
 def test_derivative_of_the_period_of_a_permanent_rotation(moments, omega):
-    """P = 2 pi/|omega|, of which the derivative along the axis is -2 pi omega/|omega|^3."""
+    """P = 2 pi/|omega|, whose derivative along the axis is -2 pi omega/|omega|^3."""
     omega = jnp.array(omega)
     gradient = jax.jit(jax.grad(lambda w: principal_periods(jnp.array(moments), w).P_phi))(omega)
     size = float(jnp.linalg.norm(omega))
@@ -262,7 +262,7 @@ def test_mixed_dtypes_are_refused():
 
 @jax.jit
 def _derivatives_by_rates(moments, omega):
-    """Forward and reverse, of each body by its own rates: (5, N, 3)."""
+    """Forward and reverse, of each body with respect to its own rates: (5, N, 3)."""
     one = [jacobian(_numbers, 1) for jacobian in (jax.jacfwd, jax.jacrev)]
     return [jax.vmap(f, (0, 0, None), 1)(moments, omega, jnp.zeros(3)) for f in one]
 

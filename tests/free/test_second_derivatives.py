@@ -1,4 +1,4 @@
-"""Second derivatives of the exact free motion against 50 digits (second_cases.json)."""
+"""Second derivatives of the closed-form free motion against 50 digits (second_cases.json)."""
 
 import json
 from pathlib import Path
@@ -17,9 +17,9 @@ CASES = json.loads(Path(__file__).with_name("second_cases.json").read_text())
 @pytest.mark.slow  # 30 s of compilation
 @pytest.mark.parametrize("products", [False, True], ids=["moments", "tensors"])
 def test_second_derivatives(products):
-    """Forward over reverse. By entries off the tensor's diagonal with ``products``, which adds the
-    derivatives of principal axes to the program; without, along pairs of directions that have no
-    such entries."""
+    """Forward over reverse mode. ``products``: with respect to products of inertia, which adds the
+    derivatives of the principal axes to the program; otherwise along directions without them.
+    """
     dtype = np.float64
     rows = {True: 0, False: 0}
 
@@ -54,9 +54,8 @@ def test_second_derivatives(products):
             size = max(1, *(np.linalg.norm(row) for row in case["second"]))
             size *= np.linalg.norm(weights[n])
             off = abs(found[n] - np.dot(weights[n], exact)) / size
-            # Sixteen e-folds at the unstable axis, squared by the second derivative; a slow body
-            # loses the ratio of a radian to what it turns through; the axes of nearly equal
-            # moments turn fast with the tensor.
+            # Larger bounds: growth by sixteen e-folds at the unstable axis, squared by the second
+            # derivative; small rotation angles; axes of nearly equal moments, which rotate fast.
             rooms = {"long at the unstable axis": 200, "slow": 2000}
             near = case["name"].startswith("sphere within") and case["products"]
             room = 400 if near else rooms.get(case["name"], 20)
@@ -68,7 +67,7 @@ def test_second_derivatives(products):
 
 @pytest.mark.slow
 def test_second_derivatives_of_many_bodies_at_once():
-    """Forward over a mapped reverse mode differentiates the compiled coefficients themselves."""
+    """Forward over vmapped reverse mode differentiates the coefficients of the derivative rule."""
     rng = np.random.default_rng(4)
     moments = 1 + rng.random((3, 3))
     omega, move = rng.normal(size=(2, 3, 3))

@@ -1,4 +1,4 @@
-"""The reference data of `polhode reference`: 17 digits, by Taylor series and polhode."""
+"""The reference data of `polhode reference`: 17 digits, against Taylor series and polhode."""
 
 import csv
 import io
@@ -41,7 +41,7 @@ def test_stored_states_agree_with_taylor_series(name, place):
 
 @pytest.mark.parametrize("moments", [(1.0, 1.0, 1.5), (0.5, 2.0, 2.0)])
 def test_steps_of_a_symmetric_body_are_those_of_one_series(moments):
-    """By which the sphere with one moment changed is moved, whose rates do not return."""
+    """For the sphere with one changed moment, whose rates do not return within a period."""
     omega = (0.5, -0.25, 1.0)
     with mp.workdps(60):
         found = by_turns([*map(mp.mpf, moments)], [*map(mp.mpf, omega)], 7.3, mp.mpf("1.1"), 40)
@@ -52,8 +52,9 @@ def test_steps_of_a_symmetric_body_are_those_of_one_series(moments):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_stored_states_and_derivatives_agree_with_taylor_series(name):
-    """States of all samples, derivatives of the last one; those of all samples are compared by
-    ``make_tumbling.py --check``, and of the first ones with the closed form below."""
+    """States of all samples, derivatives of the last one. ``make_tumbling.py --check`` compares the
+    derivatives of all samples, a test below those of the first ones with the closed form.
+    """
     *others, last = TEXTS[name]["samples"]
     assert difference(TEXTS[name], last, True, digits=70) < 0.5001
     for sample in others:
@@ -92,7 +93,7 @@ def test_closed_forms_agree_to_rounding_of_the_phase():
     stored = np.array([[s["wxyz"] for s in row["samples"]] for row in DATA["bodies"]])
     phase = 2 * np.pi * np.array(TURNS)
     angles = rotation_angles(np.asarray(traj.wxyz[:, 1:]), stored)
-    # a phase is known to eps times its size; where flips are rare, an error of the rates grows by
+    # a phase has an error of eps times its size; if flips are rare, an error of the rates grows by
     # the inverse of the distance to the separatrix
     growth = np.ones(len(ROWS))
     growth[list(ROWS).index("near_separatrix")] = 1e3
@@ -103,7 +104,7 @@ def test_closed_forms_agree_to_rounding_of_the_phase():
 def test_derivatives_of_the_closed_form_agree():
     for row in DATA["bodies"]:
         if len(set(row["moments"])) < 3 or row["name"] == "nearly_oblate":
-            continue  # derivatives by single moments of a body that is not symmetric any more
+            continue  # changing a single moment breaks the symmetry
 
         def final(parameters, times, row=row):
             scene = ph.Scene(ph.Inertia.from_moments(parameters[:3]))

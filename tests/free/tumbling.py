@@ -46,7 +46,7 @@ def _about(axis: int, angle) -> list:
 
 
 def _of_rows(R) -> list:
-    """Unit quaternion of a rotation matrix, by its largest component."""
+    """Unit quaternion of a rotation matrix, from its largest component."""
     trace = R[0][0] + R[1][1] + R[2][2]
     squares = [1 + trace] + [1 + 2 * R[i][i] - trace for i in range(3)]
     k = max(range(4), key=lambda i: squares[i])
@@ -113,7 +113,7 @@ class Motion(NamedTuple):
         return motion._replace(wxyz=tuple(quaternion_product(q, conjugate(frame))))
 
     def _amplitude(self, u):
-        """am u and its part within a half-turn, and whole half-turns of K."""
+        """am u: the part within a half-turn, and the number of half-turns of K."""
         m = self.data[4]
         K = mp.ellipk(m)
         turns = mp.nint(u / (2 * K))
@@ -127,7 +127,7 @@ class Motion(NamedTuple):
         return mp.ellippi(n, angle, m) + 2 * turns * mp.ellippi(n, m)
 
     def _in_frame(self, t):
-        """Attitude body -> the frame whose z axis is the momentum; body rates."""
+        """Attitude from the body to the frame whose z axis is the momentum; body rates."""
         a, b, c, p, m, u0, _, drift, _, share, even = self.data
         turns, angle = self._amplitude(u0 + p * t)
         whole = angle + mp.pi * turns
@@ -143,7 +143,7 @@ class Motion(NamedTuple):
         if not even:  # a right-handed triad of body axes: 1, -2, 3
             L2 = -L2
         psi = mp.atan2(L2, -L1)
-        # the continuous angle: psi goes with -/+ the amplitude, pi later
+        # the continuous angle: psi follows -/+ the amplitude, plus pi
         direction = 1 if (L1 * cosine >= 0 and (L2 >= 0) == (sine >= 0)) else -1
         psi = psi + 2 * mp.pi * mp.nint((mp.pi - direction * whole - psi) / (2 * mp.pi))
         theta = mp.atan2(mp.hypot(L1, L2), L3)
@@ -177,7 +177,8 @@ class Motion(NamedTuple):
 
 def differences(of, moments, omega) -> list[list]:
     """Derivatives of a list of numbers ``of(moments, omega)``: rows by number, columns by moment
-    and rate (six)."""
+    and rate (six).
+    """
     columns = []
     size = mp.sqrt(sum(mp.mpf(w) ** 2 for w in omega))
     for k in range(6):

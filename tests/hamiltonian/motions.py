@@ -1,6 +1,6 @@
 """Integrated motions and their gradients, for ``test_one_hamiltonian.py``.
 
-``python motions.py values`` (or ``gradients``) prints those of the package on the path.
+``python motions.py values`` (or ``gradients``) prints those of the package on the Python path.
 """
 
 import json
@@ -44,7 +44,7 @@ CASES = {
 
 
 def values(case: str, x, scale: float = 1.0):
-    """Attitudes and momenta (..., T, 7); ``scale``: what the inertia is divided by."""
+    """Attitudes and momenta (..., T, 7); ``scale``: divisor of the inertia."""
     scene, method = CASES[case]
     moments = x[:3] / scale
     state = ph.State(jnp.array(WXYZ), x[3:] / moments)

@@ -1,4 +1,4 @@
-"""Both charts come from the one H and describe the same motion."""
+"""Both coordinates follow from the one Hamiltonian and describe the same motion."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from polhode._hamiltonian import Attitude, Hamiltonian, from_quaternion, inverse
 
 
 def skew_potential(matrix, t):
-    """Looks at all of R and at t."""
+    """A potential that depends on all entries of R and on t."""
     return matrix[0, 1] * 0.3 - matrix[2, 2] + 0.2 * matrix[1, 0] * matrix[2, 1] * jnp.cos(t)
 
 
@@ -36,7 +36,7 @@ SCENES = {
 
 @pytest.mark.parametrize("name", ["weight", pytest.param("general_tensor", marks=pytest.mark.slow)])
 def test_both_charts_give_the_same_motion(name):
-    """Everything else that acts: tests/torques/test_every_torque.py."""
+    """All other torques: tests/torques/test_every_torque.py."""
     scene = SCENES[name]
     state = ph.State.from_euler(0.3, 1.1, 0.7, rates=[0.4, -0.6, 0.9])
     ts = jnp.linspace(0, 3, 4)
@@ -53,7 +53,7 @@ def test_both_charts_give_the_same_motion(name):
 
 
 def test_potential_torque_is_the_slope_along_body_turns():
-    """N_k = -dV along a small turn about body axis k, for any potential."""
+    """N_k = -dV along a small rotation about body axis k, for any potential."""
     from polhode._hamiltonian._lie_poisson import rates_and_torque
 
     scene = SCENES["any_potential_and_torques"]

@@ -1,4 +1,4 @@
-"""Autodiff of the one H gives exactly the closed forms of document 000 (corrected)."""
+"""Autodiff of the Hamiltonian gives the closed forms of document 000 (corrected)."""
 
 import json
 
@@ -31,7 +31,7 @@ BODIES = [
 
 
 def random_states(moments, dtype, n=1000):
-    """Angles with sin(theta) >= 0.1, momenta of the size that the body's rates of order 1 give."""
+    """Angles with sin(theta) >= 0.1, and momenta that correspond to body rates of order 1."""
     rng = np.random.default_rng(7)
     q = np.stack([rng.uniform(-3, 3, n), rng.uniform(0.11, 3.03, n), rng.uniform(-3, 3, n)], -1)
     qd = rng.normal(size=(n, 3))
@@ -46,9 +46,9 @@ def deviation(got, want, scale):
 
 @jax.jit
 def deviations(moments, q, qd, p) -> dict[str, jax.Array]:
-    """Largest deviation of autodiff from each closed form, over the size of the terms it adds up.
+    """Largest deviation of autodiff from each closed form, relative to the size of its terms.
 
-    So it measures rounding, not cancellation.
+    It therefore measures rounding, not cancellation.
     """
     dtype = q.dtype
     hamiltonian = ph.hamiltonian(Inertia.from_moments(moments))
@@ -184,13 +184,13 @@ def test_printed_eq_39_fails():
     equations = ph.hamiltons_equations(ph.hamiltonian(Inertia.from_moments(moments)))
     qdd = jax.jvp(lambda q, p: equations(q, p)[0], (q, p), equations(q, p))[1]
     printed = printed_eq_39(moments, q, qd)
-    np.testing.assert_allclose(printed, PRINTED_EQ_39, rtol=1e-14)  # it is the printed one
+    np.testing.assert_allclose(printed, PRINTED_EQ_39, rtol=1e-14)  # as printed
     assert abs(printed - qdd[2]) > 0.5
     np.testing.assert_allclose(doc.accelerations(moments, q, qd)[2], qdd[2], rtol=1e-13)
 
 
 def test_other_misprints_fail():
-    """Eq. 14 with its stray p_theta and eq. 10 with sin psi do not survive the check."""
+    """The check rejects eq. 14 with its stray p_theta, and eq. 10 with sin psi."""
     moments, q, p = (jnp.array(x) for x in (MOMENTS, Q, P))
     rate_q, rate_p = ph.hamiltons_equations(ph.hamiltonian(Inertia.from_moments(moments)))(q, p)
     stray = doc.theta_form(moments, q).at[2, 1].multiply(p[1])
@@ -237,5 +237,5 @@ def test_hamiltons_equations_of_angles_and_momenta_that_broadcast(unchecked):
     for got, want in zip(of_bodies(Q, P), equations(Q, P)):
         assert got.shape == (2, 3)
         np.testing.assert_allclose(got[0], want, rtol=1e-15)
-    total = ph.hamiltons_equations(lambda q, p: jnp.sum(p**2) / 2)  # of all bodies together
+    total = ph.hamiltons_equations(lambda q, p: jnp.sum(p**2) / 2)  # a sum over all bodies
     np.testing.assert_allclose(total(jnp.array([Q, Q]), momenta)[0], momenta, rtol=1e-15)

@@ -14,7 +14,7 @@ MOMENTS = jnp.array([1.0, 1.7, 2.1])
 
 @pytest.fixture(scope="module")
 def states():
-    """Random states with sin(theta) > 0.3, and what autodiff of the one H says about them."""
+    """Random states with sin(theta) > 0.3, and the derivatives of the Hamiltonian by autodiff."""
     rng = np.random.default_rng(11)
     q = jnp.asarray(rng.uniform([-3, 0.4, -3], [3, 2.7, 3], (40, 3)))
     p = jnp.asarray(rng.normal(size=(40, 3)))
@@ -29,7 +29,7 @@ def states():
 
 
 def along(function, q, qd):
-    """Derivative along the motion of a function of the angles."""
+    """Derivative of a function of the angles along the motion."""
     return jax.jit(lambda q, qd: jax.jvp(function, (q,), (qd,))[1])(q, qd)
 
 

@@ -1,4 +1,4 @@
-"""Inverse of a tensor of inertia, as the Hamiltonian needs it."""
+"""The inverse of an inertia tensor in the Hamiltonian."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ CHANGE = np.array([[1.0, 0.2, 0.0], [0.2, 0.0, -0.1], [0.0, -0.1, 0.3]])
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e9])
 def test_derivatives_in_single_precision_neither_underflow_nor_overflow(size):
-    """The determinant of the largest has the size 1e27, its square 1e54."""
+    """The determinant of the largest tensor is about 1e27, its square 1e54."""
 
     def second(dtype):
         def inverse(x):

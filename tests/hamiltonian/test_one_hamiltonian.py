@@ -1,8 +1,8 @@
-"""The kinetic energy stands in one line: a copy of the package in which that line alone has another
-factor integrates the motion of the other energy, in both coordinates, and differentiates it.
+"""The kinetic energy is written in a single line.
 
-H = 1.1 T + V is the Hamiltonian of a body with inertia I / 1.1 and the same momentum. The reference
-is the package as it is, with that inertia.
+A copy of the package with another factor in this line integrates, in both coordinates, and
+differentiates the motion of the other energy. H = 1.1 T + V is the Hamiltonian of a body with
+inertia I / 1.1 and the same momentum. The reference is the original package with that inertia.
 """
 
 import json
@@ -27,7 +27,7 @@ LINE = "kinetic = twice / 2\n"
 
 @pytest.fixture(scope="module")
 def by_another_energy(tmp_path_factory):
-    """What ``motions.py`` prints where the kinetic energy is multiplied by ``FACTOR``."""
+    """Output of ``motions.py`` for a kinetic energy multiplied by ``FACTOR``."""
     folder = tmp_path_factory.mktemp("energy")
     shutil.copytree(SOURCE, folder / "polhode", ignore=shutil.ignore_patterns("__pycache__"))
     stated = [path for path in folder.rglob("*.py") if LINE in path.read_text(encoding="utf-8")]
@@ -48,7 +48,7 @@ def by_another_energy(tmp_path_factory):
 
 
 def test_both_coordinates_follow_the_one_kinetic_energy(by_another_energy):
-    """A free body runs ``FACTOR`` times as fast, a heavy top as one with less inertia."""
+    """A free body rotates ``FACTOR`` times as fast, a heavy top as one with smaller inertia."""
     found = by_another_energy("values", "Lie-Poisson", "Euler angles")
     x = jnp.array(motions.START)
     lighter, unchanged = (np.array(motions.values("Lie-Poisson", x, f)) for f in (FACTOR, 1.0))
@@ -67,7 +67,7 @@ def test_both_coordinates_follow_the_one_kinetic_energy(by_another_energy):
 
 @pytest.mark.slow
 def test_gradients_follow_the_one_kinetic_energy(by_another_energy):
-    """Those of the flow in both coordinates, and those of steps that end at switches."""
+    """Gradients of the flow in both coordinates, and of steps that end at switches."""
     for case, gradient in by_another_energy("gradients", *motions.CASES).items():
         lighter, unchanged = (
             np.array(motions.gradients(case, jnp.array(motions.START), f)) for f in (FACTOR, 1.0)

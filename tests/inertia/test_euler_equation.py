@@ -1,4 +1,4 @@
-"""Euler's equation: theory.md 8.3 and 8.4, and where document 003's shortened form holds."""
+"""Euler's equation: theory.md 8.3 and 8.4, and where document 003's shortened form is valid."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ TENSOR = [[1.008, 0.039, 0.22], [0.039, 1.211, 0.234], [0.22, 0.234, 0.793]]
 
 
 def test_particle_of_theory_8_3():
-    # a single particle is no body to turn: its singular tensor is had from MassProperties
+    # the tensor of a single particle is singular: it is available from MassProperties only
     body = MassProperties.from_points([2.0], [[1.0, -2.0, 0.5]])
     shifted = body + MassProperties.from_points([1e-300], [[0.0, 0.0, 0.0]])
     full = shifted.central.tensor + 2 * (5.25 * np.eye(3) - np.outer([1, -2, 0.5], [1, -2, 0.5]))

@@ -1,4 +1,4 @@
-"""Properties of inertias of random clouds of points, over six decades of size."""
+"""Properties of inertias of random point clouds, over six decades of size."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ coordinates = st.tuples(*[st.integers(-4, 4)] * (3 * COUNT)).map(
 
 
 def spread(points):
-    """Whether the points span a volume, so that no moment is zero and none of them flat."""
+    """Whether the points span a volume, so that no moment is zero and no body is flat."""
     return np.linalg.matrix_rank(points - points.mean(axis=0)) == 3
 
 
@@ -34,7 +34,7 @@ def drawn(cloud, dtype):
 
 @jax.jit
 def tensors(masses, points, wxyz, shift):
-    """Tensors of a cloud, of the moved and of the rotated cloud, and what they should be."""
+    """Tensors of a cloud, of the shifted and of the rotated cloud, and the expected tensors."""
     rows = jnp.broadcast_to(wxyz, (COUNT, 4))
     body = ph.MassProperties.from_points(masses, points)
     moved = ph.MassProperties.from_points(masses, points + shift[None])
@@ -92,7 +92,9 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
 
 @jax.jit
 def tetrahedra(corners, wxyz, density):
-    """Of density one, of another one, and rotated; and five points of the same second moments."""
+    """Tetrahedra of density one, of another density, and rotated; five points with the same second
+    moments.
+    """
     one = ph.MassProperties.from_mesh(corners, FACES, density=1.0)
     dense = ph.MassProperties.from_mesh(corners, FACES, density=density)
     turned = ph.rotation.rotate(jnp.broadcast_to(wxyz, (4, 4)), corners)
@@ -105,7 +107,7 @@ def tetrahedra(corners, wxyz, density):
 @settings(max_examples=40, deadline=None)
 @given(clouds, quaternions, st.floats(-3, 3))
 def test_density_scales_mass_and_inertia(cloud, wxyz, decade):
-    """A tetrahedron: both are proportional to its density, and rotate as points do."""
+    """Both are proportional to the density of a tetrahedron, and rotate as points do."""
     corners = cloud[0][:4]
     volume = np.linalg.det(corners[1:] - corners[0]) / 6
     if abs(volume) < 0.01:
@@ -126,7 +128,7 @@ def test_density_scales_mass_and_inertia(cloud, wxyz, decade):
 @settings(max_examples=60, deadline=None)
 @given(st.tuples(*[st.floats(-3, 3)] * 3), quaternions)
 def test_moments_of_second_moments(decades, wxyz):
-    """Any second moments, from needles to plates, give a body, and only those do."""
+    """Non-negative second moments, from needles to plates, belong to a body; others do not."""
     second = 10.0 ** np.array(decades)
     moments = second.sum() - second
     body = ph.Inertia.from_moments(moments)
@@ -145,7 +147,7 @@ def test_moments_of_second_moments(decades, wxyz):
 
 
 def test_principal_axes_half_a_turn_from_those_of_the_body():
-    """The scalar part of the quaternion is zero but for rounding; alone and in a batch."""
+    """The scalar part of the quaternion is zero up to rounding; alone and in a batch."""
     moments = np.array([11.0, 18.7827941003892276, 27.7827941003892276])
     axes = np.random.default_rng(5).integers(-3, 4, (400, 3))
     axes = np.concatenate([[[1.0, -3.0, 0.0]], axes[np.any(axes != 0, axis=1)]])

@@ -1,4 +1,4 @@
-"""Shapes against their defining integrals, points, composite bodies, log-Cholesky, boundary."""
+"""Shapes against their defining integrals, points, composite bodies, log-Cholesky, flat bodies."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from polhode.rotation import axis_angle_to_wxyz, wxyz_to_matrix
 
 
 def of_revolution(outer, inner, low, high):
-    """Moments per mass and height of the centre of a solid of revolution, by quadrature."""
+    """Moments per mass, and height of the centre, of a solid of revolution, by quadrature."""
     with mp.workdps(25):
         volume = mp.quad(lambda z: outer(z) ** 2 - inner(z) ** 2, [low, high])
         height = mp.quad(lambda z: z * (outer(z) ** 2 - inner(z) ** 2), [low, high]) / volume
@@ -195,7 +195,7 @@ def test_points_batched_and_differentiable():
         return body.central.tensor[0, 1] + body.central.tensor[2, 2]
 
     by_mass, by_place = jax.jit(jax.grad(probe, (0, 1)))(jnp.asarray(masses), jnp.asarray(points))
-    # d/dm and d/dx of sum m (d d^T stuff) about the moving centre: its own motion drops out
+    # derivatives of sums about the centre of mass: the motion of the centre does not contribute
     centre = (masses @ points) / masses.sum()
     d = points - centre
     np.testing.assert_allclose(
@@ -272,7 +272,7 @@ def test_log_cholesky_of_a_flat_body_is_infinite_and_no_more(flat):
     np.testing.assert_array_equal(jnp.sum(parameters == -jnp.inf, axis=-1), [1, 0])
     back = MassProperties.from_log_cholesky(parameters[1])
     np.testing.assert_allclose(back.central.tensor, several.tensor[1], rtol=1e-14)
-    # rounding may leave a square below zero, which is not that of a body beyond the boundary
+    # rounding may make a square slightly negative; this body is still possible
     matrix = wxyz_to_matrix(axis_angle_to_wxyz([1 / 3, 2 / 3, 2 / 3], jnp.linspace(0.1, 3, 100)))
     turned = inertia_to_log_cholesky(jnp.einsum("nij,jk,nlk->nil", matrix, tensor, matrix))
     assert not jnp.any(jnp.isnan(turned))

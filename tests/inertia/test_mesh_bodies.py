@@ -79,7 +79,7 @@ def test_derivative_by_vertices():
         ],
         rtol=1e-13,
     )
-    # each vertex by itself: the volume grows by the vector area around it, over 3
+    # derivative by a vertex: a third of the vector area of its faces
     by_vertex = jax.grad(lambda v: MassProperties.from_mesh(v, FACES, density=1.0).mass)(
         jnp.asarray(CORNERS)
     )

@@ -1,4 +1,4 @@
-"""Numbers that a body can have: told by the constructors, and by a status while traced."""
+"""Moments that a body can have: constructors check them, and the status reports traced ones."""
 
 import equinox as eqx
 import jax
@@ -15,14 +15,14 @@ WATER, TEXTBOOK = (0.345, 0.653, 1.0), (2.0, 1.0, 2 / 3)
 
 
 def turned(moments, rng):
-    """Tensors of these moments in random axes, symmetric to the last bit."""
+    """Tensors with these moments in random axes, symmetric to the last bit."""
     q, _ = np.linalg.qr(rng.normal(size=(*moments.shape, 3)))
     tensor = q * moments[..., None, :] @ np.swapaxes(q, -1, -2)
     return (tensor + np.swapaxes(tensor, -1, -2)) / 2
 
 
 def drawn(rng, n):
-    """Moments over six decades of size, half of them those of bodies; some flat, some needles."""
+    """Moments over six decades of size, half of them possible; some flat, some needles."""
     spread = 10 ** rng.uniform(-5, 0, (n, 3))
     spread[: n // 8, 0] = 0
     moments = spread.sum(axis=-1, keepdims=True) - spread
@@ -80,7 +80,7 @@ def test_the_status_tells_what_no_body_has():
     tensors = jnp.stack([jnp.diag(moments[0]), jnp.diag(moments[2]), skew, jnp.full((3, 3), 1.0)])
     wrong = ph.Status.NOT_PHYSICAL
     np.testing.assert_array_equal(of_tensor(tensors), [0, wrong, wrong, wrong])
-    # known numbers that were given by name are judged when they move
+    # values passed by keyword are checked in a simulation
     with pytest.raises(ph.SimulationError, match="no body has this inertia"):
         ph.simulate(ph.Scene(Inertia(diagonal=[2.0, 1.0, -0.5])), STATE, TS)
 
@@ -130,7 +130,7 @@ def test_the_obvious_call_does_what_is_meant():
 
 
 def test_a_step_keeps_the_symmetry():
-    """No step in the leaves of a symmetric inertia leaves the symmetry, and slopes add up."""
+    """A step in the leaves of a symmetric inertia preserves the symmetry; derivatives add up."""
     omega = jnp.array([0.5, -1.0, 2.0])
 
     def energy(inertia):

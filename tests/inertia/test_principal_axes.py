@@ -1,4 +1,4 @@
-"""The batched eigen-decomposition against 50 digits, and its derivatives at equal moments."""
+"""The batched eigendecomposition against 50 digits, and its derivatives at equal moments."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def turns(count, seed=0):
 
 
 def matrix(wxyz):
-    """R of unit quaternions in float64, written out independently of the package."""
+    """R of unit quaternions in float64, implemented independently of the package."""
     w, v = wxyz[..., 0], wxyz[..., 1:]
     hat = np.zeros((*w.shape, 3, 3))
     hat[..., 2, 1], hat[..., 0, 2], hat[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
@@ -39,7 +39,7 @@ def matrix(wxyz):
 
 
 def tensors(dtype):
-    """Adversarial spectra: random, clustered to rounding, needles, plates; random axes."""
+    """Difficult spectra: random, clustered to rounding, needles, plates; random axes."""
     rng = np.random.default_rng(3)
     n = 60
     spectra = np.concatenate(
@@ -95,7 +95,7 @@ def test_identity_axes_for_a_sorted_diagonal_tensor():
 
 
 def whole(tensor):
-    """The tensor put together again from moments, products and the constant axes."""
+    """The tensor reassembled from moments, products and the constant axes."""
     moments, wxyz, (p, q, r) = principal(tensor)
     a, b, c = moments
     inner = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])

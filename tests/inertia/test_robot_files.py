@@ -1,4 +1,4 @@
-"""Mass properties from the model files of robots."""
+"""Mass properties from model files of robots."""
 
 import warnings
 
@@ -36,7 +36,7 @@ def arm(tmp_path):
 
 
 def test_a_link_of_a_urdf_file(arm):
-    """The tensor stands in the axes of the inertial frame: roll about x first, all axes fixed."""
+    """The tensor refers to the axes of the inertial frame: roll about x first, fixed axes."""
     hand = MassProperties.from_urdf(arm, "hand")
     own = np.array([[0.10, 0.01, -0.005], [0.01, 0.12, 0.002], [-0.005, 0.002, 0.07]])
     turned = (
@@ -50,7 +50,7 @@ def test_a_link_of_a_urdf_file(arm):
 
 
 def test_mujoco_reads_the_same_link(arm):
-    """MuJoCo's own reader of URDF is the independent truth."""
+    """MuJoCo's own URDF reader is the independent reference."""
     pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
     ours, theirs = MassProperties.from_urdf(arm, "hand"), MassProperties.from_mjcf(arm, "hand")
     np.testing.assert_allclose(ours.centre, theirs.centre, atol=1e-12)
@@ -58,7 +58,7 @@ def test_mujoco_reads_the_same_link(arm):
 
 
 def test_a_body_of_an_mjcf_file(tmp_path):
-    """Without an inertial element it follows from the geoms: a box turned about z by 90 degrees."""
+    """Without an inertial element it follows from the geoms: a box rotated about z by 90 deg."""
     pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
     path = tmp_path / "box.xml"
     path.write_text(MJCF)

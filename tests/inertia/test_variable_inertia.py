@@ -15,7 +15,7 @@ SPAN = 12.0
 
 
 def moments(t, a, xp):
-    """Booms that run out: the moments grow by up to ``a``."""
+    """Booms that extend: the moments grow by up to ``a``."""
     s = 1 - xp.exp(-0.2 * t)
     return xp.stack([1.0 + a * s, 1.5 + 0.5 * a * s, 2.0 + 0.25 * a * s + 0 * t])
 
@@ -41,7 +41,7 @@ def matrix(q):
 
 
 def by_hand(inertia_of, a, forced):
-    """Euler's equations in the rates, dI/dt by a difference that is exact to 1e-10."""
+    """Euler's equations in the rates, with dI/dt by a difference that is accurate to 1e-10."""
     h = 1e-4
 
     def rates(t, y):

@@ -1,4 +1,4 @@
-"""Files made to keep the parser busy or to break it: refused at once, with the place named."""
+"""Files designed to overload or break the parser: rejected at once, with the position named."""
 
 import pytest
 
@@ -51,7 +51,7 @@ def test_a_file_without_an_end_is_refused(tmp_path):
 
 
 def test_the_schema_and_the_page_name_the_same_keys():
-    """Every key of the schema stands in docs/scene_files.md, and a scene of every kind fits."""
+    """docs/scene_files.md contains every key of the schema, and a scene of every kind validates."""
     import re
     from pathlib import Path
 
@@ -64,7 +64,7 @@ def test_the_schema_and_the_page_name_the_same_keys():
     words = set(re.findall(r"\w+", " ".join(re.findall(r"`+[^`]+`+", page, re.DOTALL))))
     assert len(keys) > 70
     assert keys - words == set()
-    # choices too: shapes, kinds, units
+    # also choices: shapes, kinds, units
     choices = {
         c
         for t in tables

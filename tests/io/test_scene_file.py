@@ -1,4 +1,4 @@
-"""The scene file's schema: good files read as meant, bad ones name the key and the cure."""
+"""The scene file's schema: valid files are read correctly; errors name the key and the fix."""
 
 import datetime
 import math
@@ -131,7 +131,7 @@ def test_each_mistake_is_named_with_its_cure(old, new, key, hint):
 
 
 def test_only_keys_of_the_same_table_are_suggested():
-    """Not ``seed`` and ``speed`` of other tables, nor those of other kinds of torques."""
+    """Not ``seed`` and ``speed`` of other tables, nor keys of other kinds of torques."""
     torque = "[torque]\nkind='pointing'\nkp=1\n{}\n[state]"
     for keys, hint in (("kd=1\nspeed=3", ""), ("kdd=1", "kd"), ("kd=1\nmax_moment=1", "")):
         with pytest.raises(SceneFileError) as caught:

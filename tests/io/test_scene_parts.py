@@ -1,4 +1,4 @@
-"""Orbits, wheels, control laws, pulses and events of a scene file are those of Python."""
+"""Orbits, wheels, control laws, pulses and events of a scene file equal those built in Python."""
 
 import re
 from pathlib import Path
@@ -67,7 +67,7 @@ TORQUES = {
 
 
 def same(a, b):
-    """Equal but for the weak types of numbers that Python code leaves open."""
+    """Equal except for the weak types of Python numbers."""
     pairs = zip(_leaves(a), _leaves(b), strict=True)
     return type(a) is type(b) and all(np.array_equal(x, y) for x, y in pairs)
 
@@ -136,10 +136,10 @@ unit = "deg/s"
 """
 
 
-@pytest.mark.slow  # events: tests/test_events
+@pytest.mark.slow  # faster: events, tests/test_events
 def test_events_are_at_the_times_at_which_they_are(tmp_path, monkeypatch, capsys):
-    """A ball turns about x at 0.5 rad/s: its y axis is cos(t/2) from space y, sin(t/2) over the
-    plane, so that the angle to space z rises through 60 degrees when t/2 = 150 degrees.
+    """A ball rotates about x at 0.5 rad/s: its y axis is cos(t/2) along space y and sin(t/2) along
+    space z, so that the angle to space z rises through 60 degrees when t/2 = 150 degrees.
     """
     import xarray
 

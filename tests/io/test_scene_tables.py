@@ -86,7 +86,7 @@ def test_torques_are_those_of_python(text):
 def test_the_velocity_of_drag_may_be_that_of_the_orbit():
     text = f'[torque]\nkind = "drag"\ndensity = 1e-11\nvelocity = "orbit"{PLATES}{ORBIT}'
     torque = build_scene(parse_scene(BODY + text), np.float64).torque
-    # a circle: v = sqrt(mu / a) along y where x is the direction of the body
+    # a circular orbit: v = sqrt(mu / a) along y when the position is along x
     np.testing.assert_allclose(
         torque.velocity(jnp.array(0.0)), [0, np.sqrt(3.986e14 / 6.9e6), 0], atol=1e-6
     )

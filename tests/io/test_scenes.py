@@ -1,4 +1,4 @@
-"""The scenes that come with the project read, build in both dtypes and say what they claim."""
+"""The included scenes can be read and built in both dtypes, and agree with their stated values."""
 
 from pathlib import Path
 
@@ -66,7 +66,7 @@ def test_clones_are_drawn_as_the_file_says():
     np.testing.assert_allclose(rates.std(axis=0), 0.08, rtol=5 / np.sqrt(2000))
     # independent streams: no correlation between quantities
     assert abs(np.corrcoef(relative[:, 0], rates[:, 0])[0, 1]) < 5 / np.sqrt(1000)
-    # the same draws in float32, and unchanged when another spread is taken out
+    # the same draws in float32, and unchanged if another spread is removed
     single = draw_clones(file, np.float32)
     np.testing.assert_allclose(single.inertia.moments, moments, rtol=1e-6)
 
@@ -134,7 +134,7 @@ def test_everything_that_acts_is_built_and_adds_up():
         wheel, flywheel = scene.rotors.terms
         np.testing.assert_array_equal(gravity.centre, np.array([0, 0, 0.1], dtype))
         np.testing.assert_array_equal(wheel.direction, [0, 0, 1])
-        # an ensemble, whose method is chosen without numbers, has the closed forms of its file
+        # an ensemble uses the closed form that its scene file declares
         assert gravity.distance is not None
         assert (wheel.axis, flywheel.axis) == (2, 0)
         assert float(wheel.speed) == 7

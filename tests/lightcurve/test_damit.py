@@ -1,4 +1,4 @@
-"""Export in the form of DAMIT, read back by Kaasalainen's formulas alone."""
+"""Export in the format of DAMIT, read back by Kaasalainen's formulas alone."""
 
 import csv
 
@@ -97,7 +97,7 @@ BODIES = {
 @pytest.mark.parametrize("name", BODIES)
 def test_the_files_give_the_motion_back(name, tmp_path):
     moments, omega = BODIES[name]
-    # semi-axes of a homogeneous ellipsoid do not matter here: any order along the body axes
+    # the order of the semi-axes along the body axes does not matter here
     solution, scene, state = solution_of(moments, omega)
     assert solution.mode == (ph.Mode.SAM if name.startswith("short") else ph.Mode.LAM)
     assert solution.to_damit(tmp_path, jd_of_zero=2450000.0) == tmp_path
@@ -138,8 +138,9 @@ def test_facets_are_counterclockwise_from_outside(tmp_path):
 
 
 def test_the_convention_is_that_of_a_published_tumbler(tmp_path):
-    """(99942) Apophis: E over that of the basic spin state is 1.024 +- 0.013 (Pravec et al. 2014),
-    which the published moments and periods give in this convention."""
+    """(99942) Apophis: E divided by that of the basic spin state is 1.024 +- 0.013 (Pravec et al.
+    2014), which follows from the published moments and periods in this convention.
+    """
     I1, I2, P_psi, P_phi = 0.61, 0.965, 263.0, 27.38
     text = "lambda,beta,P_psi,P_phi,I1,I2,phi0,psi0,JD0\n"
     (tmp_path / "tumbler.csv").write_text(text + f"250,-75,{P_psi},{P_phi},{I1},{I2},152,14,0\n")

@@ -1,4 +1,4 @@
-"""Tumblers found again from their light alone; derivatives, mirrors, messages."""
+"""Tumbling bodies recovered from their light curves; derivatives, mirror images, messages."""
 
 import types
 
@@ -30,7 +30,7 @@ def seen():
 
 @pytest.fixture(scope="module")
 def trial(seen):
-    """Eight bodies of given periods in each mode."""
+    """Eight bodies with the same periods in each mode."""
     meant = _frequencies.Hypotheses(
         np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False])
     )
@@ -50,7 +50,7 @@ def test_trial_bodies_have_the_periods_asked(trial):
 
 
 def test_model_is_that_of_simulate(seen, trial):
-    """Light worked out by the public pieces, one body at a time."""
+    """Brightness computed with public functions, one body at a time."""
     curve, _, points = seen
     values = magnitudes(trial, points)
     x = np.asarray(trial.unknowns[0])
@@ -72,7 +72,9 @@ def test_model_is_that_of_simulate(seen, trial):
 
 
 def test_light_has_the_sums_of_its_mode(trial):
-    """Constant directions: the variance is in a few sums, whose parity is that of the mode."""
+    """With constant directions few combinations of the frequencies contain the variance; their
+    parity depends on the mode.
+    """
     t = np.r_[0, np.sort(np.random.default_rng(4).uniform(0, 60, 127))]
     sun, observer = np.tile([1.0, 0, 0], (128, 1)), np.tile([0.8, 0.6, 0], (128, 1))
     curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
@@ -88,7 +90,7 @@ def test_light_has_the_sums_of_its_mode(trial):
     assert np.median(other) > 0.3
 
 
-@pytest.mark.slow  # values: test_model_is_that_of_simulate
+@pytest.mark.slow  # faster: values, test_model_is_that_of_simulate
 def test_derivatives_by_every_unknown(seen, trial):
     _, _, points = seen
     value, slopes = jax.jit(lambda *x: _brightness.magnitudes_and_derivatives(PHASE, *x))(
@@ -105,7 +107,9 @@ def test_derivatives_by_every_unknown(seen, trial):
 
 
 def test_steps_keep_the_frequencies_that_they_mean(trial):
-    """To first order as plain steps; to second only the frequencies are as the step says."""
+    """Equal to plain steps to first order; to second order the frequencies change as the step
+    intends.
+    """
 
     @jax.jit
     def logs(unknowns):
@@ -114,13 +118,13 @@ def test_steps_keep_the_frequencies_that_they_mean(trial):
 
     unknowns, wxyz = trial
     step = jnp.zeros((len(wxyz), unknowns.shape[1] + 3)).at[:, 0].set(0.03).at[:, 5].set(0.02)
-    # by differences of fourth order: the derivative would be one more program
+    # by differences of fourth order, since the derivative would be another program
     ends = [logs(unknowns + 0.01 * k * step[:, :-3]) for k in (-2, -1, 1, 2)]
     meant = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / 0.12
     plain = logs(unknowns + step[:, :-3]) - logs(unknowns) - meant
     moved = STEPPED(trial, step)
     rest = logs(moved.unknowns) - logs(unknowns) - meant
-    # near the separatrix a body keeps its plain step
+    # near the separatrix the step is not corrected
     mended = np.abs(rest).max(1) < 1e-5
     assert mended.mean() > 0.7
     assert np.median(np.abs(plain)[mended]) > 100 * np.median(np.abs(rest)[mended])
@@ -163,7 +167,7 @@ def test_a_list_that_ends_before_the_odds_do_says_so():
 
 @pytest.mark.slow
 def test_a_tumbler_is_found_again():
-    """One night of one geometry, with a gap: the body, or its mirror image."""
+    """One night in one geometry, with a gap: the body, or its mirror image."""
     minute, rng = 1 / 1440, np.random.default_rng(1)
     square = np.array([1.0, 0.6, 0.4]) ** 2
     inertia = ph.Inertia(square.sum() - square)
@@ -183,7 +187,7 @@ def test_a_tumbler_is_found_again():
     fit = lightcurve.fit_light_curve(curve, floor=0.005, trials=8_000)
     best, text = fit.best, lightcurve.table(fit)
     assert int(best.mode) == int(truth.mode), text
-    # the first time of the light curve is not that of the state: periods do not change
+    # another first time of the light curve does not change the periods
     assert best.P_phi == pytest.approx(float(truth.P_phi), rel=2e-3), text
     assert best.P_psi == pytest.approx(float(truth.P_psi), rel=5e-3), text
     pole = np.asarray(_solutions.momentum(body))[0]
@@ -230,7 +234,7 @@ def test_tc4_in_the_night_of_2012(shared, tmp_path):
         pytest.skip("the folder of light curves is absent")
     pytest.importorskip("matplotlib")
     said = []
-    # every third point: as many as a search looks at, so that search and fit are one program
+    # every third point, the number that a search uses: search and fit share a program
     header, *rows = (folder / "tc4_2012.csv").read_text().splitlines()
     few = tmp_path / "few.csv"
     few.write_text("\n".join([header, *rows[::3]]) + "\n")

@@ -1,4 +1,4 @@
-"""Two-dimensional Fourier series against sums over the points, and what pairs mean."""
+"""Two-dimensional Fourier series against sums over the points, and their interpretations."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ F_PHI, F_PSI = 1.7, 0.6
 
 @pytest.fixture(scope="module")
 def series():
-    """A series of sums of multiples of F_PHI and 2 F_PSI with gaps, an offset a night, noise."""
+    """A series in combinations of F_PHI and 2 F_PSI, with gaps, an offset per night, and noise."""
     rng = np.random.default_rng(3)
     t = np.sort(np.concatenate([k + 0.4 * rng.uniform(size=40) for k in (0, 1, 2, 4, 7, 8)]))
     night = np.floor(t)
@@ -36,13 +36,13 @@ def test_pairs_explain_what_least_squares_say(series, even):
         whole = np.hstack([*basis, np.cos(phases), np.sin(phases)])
         left = [value - m @ np.linalg.lstsq(m, value, rcond=None)[0] for m in (columns.T, whole)]
         explained = 1 - np.sum(left[1] ** 2) / np.sum(left[0] ** 2)
-        # sums near a multiple of one a day are almost constants of the nights
+        # combinations near a multiple of one per day are nearly constant within nights
         assert found.explained[k] == pytest.approx(explained, abs=0.01)
     assert found.explained[0] > 0.9
 
 
 def _long(waves):
-    """Twenty nights in sixty days of sums of F_PHI and F_PSI."""
+    """Twenty nights in sixty days of a series in F_PHI and F_PSI."""
     rng = np.random.default_rng(5)
     start = np.sort(rng.choice(60, 20, replace=False))
     t = np.sort(start[:, None] + rng.uniform(0, 0.3, (20, 20)), axis=1).ravel()
@@ -71,13 +71,13 @@ SHORT_AXIS = ((1, 1, 0.2, 1.0), (2, 0, 0.15, 2.0), (2, 2, 0.05, 0.5))
     ],
 )
 def test_hypotheses_hold_the_body(waves, long_axis):
-    """Also where the harmonics of one line are nearly all: no multiple of it is taken for two."""
+    """Also if harmonics of one line dominate: multiples of one line are not used as two lines."""
     t, value = _long(waves)
     found = lightcurve.fourier_lattices(t, value, max_frequency=7.0)
     meant = _frequencies.hypotheses(found, t, value)
     near = np.hypot(meant.f_phi - F_PHI, meant.f_psi - F_PSI) < 0.5 * found.resolution
     assert np.any(near[:20] & (meant.long_axis[:20] == long_axis))
-    # no moment exceeds the sum of the other two: SAM turns no slower about L than its long axis
+    # by the triangle inequality, precession is not slower than the rotation about the long axis
     assert np.all(meant.long_axis | (meant.f_psi <= meant.f_phi))
     assert len(near) <= 800
 
@@ -99,7 +99,7 @@ def test_meaning_names_mode_and_sums():
 
 
 def test_lattices_find_the_sums_of_a_long_curve():
-    """Two lines of the body come first, and explain what least squares say."""
+    """The pair of the body is the first, with the variance of a least-squares fit."""
     t, value = _long(MIXED)
     found = lightcurve.fourier_lattices(t, value, max_frequency=5.0, keep=20)
     assert np.all(np.diff(found.explained) <= 0)
@@ -114,7 +114,7 @@ def test_lattices_find_the_sums_of_a_long_curve():
 
 
 def test_default_range_holds_the_lines_of_a_fast_tumbler():
-    """Short-axis mode of 12.0 and 29.2 h in 60 days: its strongest line is that of 4.0 per day."""
+    """Short-axis mode, 12.0 and 29.2 h, in 60 days: the strongest line is at 4.0 per day."""
     rng = np.random.default_rng(0)
     start = np.sort(rng.choice(60, 16, replace=False))
     t = np.sort(start[:, None] + rng.uniform(0, 0.3, (16, 25)), axis=1).ravel()

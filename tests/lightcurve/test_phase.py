@@ -1,4 +1,4 @@
-"""Phase functions against published tables and another implementation's numbers."""
+"""Phase functions against published tables and another implementation."""
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def test_published_values(phase, coefficients, published):
 
 @pytest.mark.parametrize("table", ["_FIRST", "_SECOND", "_THIRD"])
 def test_slopes_printed_are_those_of_the_cubic_spline(table):
-    """The slopes inside follow from the values and the end slopes: two tables, one spline."""
+    """The inner derivatives follow from the values and the end derivatives: one spline."""
     interpolate = pytest.importorskip("scipy.interpolate")
     values, slopes = getattr(_brightness, table)
     knots = _brightness._NEAR if table == "_THIRD" else _brightness._KNOTS

@@ -1,4 +1,4 @@
-"""Readers of light curves: what they take, what they assume, and what they say of bad files."""
+"""Readers of light curves: accepted formats, assumptions, and errors for invalid files."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_table_is_reduced_to_unit_distance_and_to_the_body(table):
 
 
 def test_barycentric_times_are_moved_to_the_body(table):
-    """The Sun, at the origin, stands for the barycentre; the body is at -SUN."""
+    """The Sun, at the origin, represents the barycentre; the body is at -SUN."""
     text = table.read_text()
     observer, delta = OBSERVER - SUN, np.linalg.norm(OBSERVER)
     shift = LIGHT_TIME * observer @ -OBSERVER / delta

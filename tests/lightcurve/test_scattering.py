@@ -1,4 +1,4 @@
-"""Light of ellipsoids, spheres and facets against integration over the surface."""
+"""Brightness of ellipsoids, spheres and facets against integration over the surface."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ RNG = np.random.default_rng(19)
 
 
 def _integrals(axes, sun, observer, n=500):
-    """Lommel-Seeliger and Lambert brightness by quadrature over the surface, from the laws."""
+    """Lommel-Seeliger and Lambert brightness by quadrature over the surface."""
     z, weight = np.polynomial.legendre.leggauss(n)
     angle = (np.arange(2 * n) + 0.5) * np.pi / n
     across = np.sqrt(1 - z * z)
@@ -54,7 +54,7 @@ def test_ellipsoid_against_integration(case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_derivatives_of_ellipsoid(case):
-    """Also at opposition, where an angle would have a corner and its logarithm a pole."""
+    """Also at opposition, where an angle would have a kink and its logarithm a pole."""
     whole = jnp.concatenate([jnp.asarray(x) for x in case])
 
     def value(x):
@@ -107,9 +107,9 @@ def test_facets_of_ellipsoid_and_of_harmonics():
     assert other == pytest.approx(float(found), rel=0.02)
 
 
-@pytest.mark.slow  # of ellipsoids: test_fit
+@pytest.mark.slow  # faster: of ellipsoids, test_fit
 def test_derivatives_of_facets_through_motion_and_shape():
-    """By moments, rates, attitude, vertices of a mesh, and harmonics of the curvature."""
+    """With respect to moments, rates, attitude, mesh vertices, and harmonics of the curvature."""
     moments, vertices, faces = light_curves.blunt(np.array([1.0, 0.7, 0.5]))
     ts = jnp.linspace(0.0, 5.0, 7)
     sun, observer = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.8, 0.0, 0.6])
@@ -199,7 +199,9 @@ def _faceted(corners):
 
 @pytest.mark.slow
 def test_what_ellipsoids_miss_of_other_bodies_grows_as_the_floor_does():
-    """The best ellipsoid below 30 degrees, seen at greater phase angles: bodies at random."""
+    """Error at larger phase angles of the ellipsoid that fits best below 30 degrees, for random
+    bodies.
+    """
     rng, many = np.random.default_rng(5), 150
     angles = np.radians([3.0, 25.0, 60.0, 90.0, 120.0])
     ellipsoid = jax.jit(

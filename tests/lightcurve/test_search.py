@@ -1,4 +1,6 @@
-"""Trial bodies: they have the periods asked, the best of each are kept; normal points."""
+"""Trial bodies have the requested periods, and the best of each hypothesis are retained; normal
+points.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ def test_bodies_have_the_periods_of_their_hypothesis():
     f_phi, f_psi, found = _solutions.frequencies(bodies)
     np.testing.assert_allclose(f_phi[good], np.repeat(MEANT.f_phi, 32)[good], rtol=1e-9)
     np.testing.assert_allclose(f_psi[good], np.repeat(MEANT.f_psi, 32)[good], rtol=1e-2)
-    # never the other mode; inertias at their bounds have a symmetry, and a mode of their own
+    # never the other mode; inertias at their bounds are symmetric, with a separate mode
     other = np.where(mode, ph.Mode.SAM, ph.Mode.LAM)
     assert not np.any((found == other) & good)
 
@@ -32,7 +34,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     curve, truth, _ = light_curves.synthetic(9, 0.02, nights=10, days=12.0, each=12)
     points = curve.points(0.01)
     right = 1 / truth["P_phi"], 1 / truth["P_psi"]
-    # the right one among eight that are off by one to eight steps of the resolution
+    # the right pair among eight with offsets of one to eight steps of the resolution
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
     meant = Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
     key = jax.random.key(0)
@@ -40,7 +42,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))
     f_phi, *_ = _solutions.frequencies(trials.bodies)
     np.testing.assert_allclose(f_phi, meant.f_phi[trials.source], rtol=1e-9)
-    # the best of 200 fit better than others, and are in order
+    # the best of 200 fit better than the others, and are sorted
     misfit, _ = _search.misfits(PHASE, trials.bodies, points)
     misfit = misfit.reshape(9, 3)
     assert np.all(np.diff(misfit, axis=1) >= 0)
@@ -90,7 +92,7 @@ def test_poles_of_one_pair_do_not_crowd_out_others():
 
 
 def test_spread_of_offsets_is_the_likeliest():
-    """Twelve groups of a linear model with three other unknowns; all of them integrated out."""
+    """Twelve groups of a linear model with three other unknowns, which are integrated out."""
     rng = np.random.default_rng(1)
     group = np.repeat(np.arange(12), 6)
     other = np.c_[rng.normal(size=(72, 2)), np.ones(72)]
@@ -122,7 +124,7 @@ def test_misfit_is_that_of_the_light_times_the_gain():
     points = curve.points(0.01)
     assert np.asarray(body.unknowns).shape == (1, 9)
     misfit, gain = _search.misfits(PHASE, body, points)
-    # noise 0.02, robust, and as little as the offsets leave
+    # noise of 0.02, robust cost, minus the part that the offsets fit
     assert 0.01 < np.sqrt(misfit[0]) < 0.025
     assert gain[0] == pytest.approx(1.0, abs=0.05)
     flat = body._replace(unknowns=jnp.asarray(body.unknowns).at[:, 2:4].multiply(0.8))
@@ -130,7 +132,7 @@ def test_misfit_is_that_of_the_light_times_the_gain():
 
 
 def test_likeness_is_the_variance_of_sums_over_that_of_independent_ones():
-    """Nights of 20 points with a correlation of 0.7 from one to the next; the sums of 400 draws."""
+    """Nights of 20 points with a correlation of 0.7 between neighbours; the sums of 400 draws."""
     rng = np.random.default_rng(2)
     night = np.repeat(np.arange(20), 20)
     t = night + 0.01 * np.tile(np.arange(20), 20)

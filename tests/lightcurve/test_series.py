@@ -1,4 +1,4 @@
-"""Bodies are turned to where their light comes nearest to the series of the points."""
+"""Phases of trial bodies are chosen so that their series is closest to that of the points."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def moved(bodies, later):
 
 @pytest.fixture(scope="module")
 def blank():
-    """Directions that keep still, and a night that is brighter than the other."""
+    """Constant directions, and two nights with different offsets."""
     t = np.sort(np.random.default_rng(0).uniform(0, 10, 256))
     sun, observer = np.array([1.0, 0, 0.1]), np.array([np.cos(0.4), np.sin(0.4), -0.1])
     return lightcurve.LightCurve.of(
@@ -41,7 +41,9 @@ def blank():
 @pytest.mark.parametrize("mode", [0, 1])
 @pytest.mark.slow
 def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
-    """A body that explains the points; copies of it, anywhere on the polhode and about the pole."""
+    """A body that explains the points; copies of it with other phases on the polhode and about the
+    momentum.
+    """
     meant = Hypotheses(*(x[mode : mode + 1] for x in MEANT))
     draws, long_axis = _search.draw(jax.random.key(3), meant, MANY)
     bodies, good = _search.build(draws, long_axis, PHASE)
@@ -50,7 +52,7 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     light = np.asarray(magnitudes(PHASE, bodies, points))[first, : blank.t.size]
     points = blank._replace(magnitude=light + 0.3 * (blank.t > 5)).points(0.0)
     right, matrix = _search.series(points, *meant)
-    # the same body at other times and turned about its momentum: all that phases are
+    # the same body at other times and rotated about its momentum: other phases
     later = jnp.asarray(np.random.default_rng(1).uniform(0, 10, (MANY, 1)))
     same = jax.tree.map(lambda x: jnp.tile(x[first], (MANY, 1)), bodies)
     rates, wxyz = moved(same, later)
@@ -74,7 +76,7 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     # 15 degrees at most from the nearest node in either angle
     assert np.median(before) > 0.3 * whole
     assert np.max(after) < 0.15 * whole
-    # what the series says of it: all but that part of chi-square is explained
+    # the fraction of chi-square that the series does not explain
     data = points.magnitude[0, : len(light)]
     fall = np.asarray(fall, float)
     assert np.min(fall) * 0.02**2 / len(light) > 0.7 * whole

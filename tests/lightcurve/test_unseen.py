@@ -1,4 +1,4 @@
-"""The benchmark of unseen curves: its light curves, which do not use the package, and scores."""
+"""The benchmark of unseen light curves: its light curves, without the package, and its scores."""
 
 import json
 from types import SimpleNamespace
@@ -80,7 +80,7 @@ def test_scores_of_the_benchmark():
 
 
 def test_a_run_continues_where_it_was_stopped(tmp_path, monkeypatch, capsys):
-    """With the search replaced: curves in the file are not fitted again."""
+    """With a replaced search: curves in the file are not fitted again."""
     fitted = []
 
     def fit(curve):

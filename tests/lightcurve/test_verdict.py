@@ -1,4 +1,4 @@
-"""Null hypotheses and verdicts: noise, rotators, too few points, rivals, misfits."""
+"""Null hypotheses and verdicts: noise, rotators, too few points, rival solutions, misfits."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def curve_of(light, seed=0, nights=10, days=20, each=24, noise=NOISE, sigma=NOIS
 
 
 def rotating(t, period=0.37):
-    """Light of one period with four harmonics."""
+    """Brightness with one period and four harmonics."""
     return sum(
         a * np.cos(2 * np.pi * k * t / period + k) for k, a in ((1, 0.05), (2, 0.2), (4, 0.04))
     )
@@ -67,7 +67,7 @@ def pairs_of(curve):
 
 @pytest.fixture(scope="module")
 def cases():
-    """Curves of each kind, their pairs, and the null hypotheses fitted."""
+    """Curves of each kind, their pairs of frequencies, and the fitted null hypotheses."""
     out = {}
     for name, light in (("noise", flat), ("rotator", rotating), ("tumbler", tumbling)):
         curve = curve_of(light, each=12)
@@ -82,7 +82,7 @@ def verdict(case, *solutions, reproduced=True):
 
 
 def offset_free(case, light):
-    """A model of the case's curve: the light, and offsets that fit best."""
+    """A model of the case's curve: the brightness, and the best offsets."""
     curve, _, linear, _ = case
     rest = curve.magnitude - light(curve.t - curve.t[0])
     free = linear.columns.T
@@ -100,7 +100,7 @@ def test_noise_alone_is_no_signal(cases):
 
 
 def test_one_period_is_told_from_tumbling(cases):
-    """Also where a body explains the points as well as the rotator: it has more parameters."""
+    """Also if a tumbling body fits as well as the rotator: it has more parameters."""
     case = cases["rotator"]
     found = verdict(case, solution(offset_free(case, rotating)))
     assert found.verdict is Verdict.ONE_PERIOD
@@ -109,7 +109,7 @@ def test_one_period_is_told_from_tumbling(cases):
     assert single.name.startswith("one period")
     assert min(abs(single.periods[0] / p - 1) for p in (0.37, 0.185)) < 1e-3
     assert single.misfit == pytest.approx(1.0, abs=0.15)
-    # a body that explains less does not change that
+    # a body that fits worse does not change this
     worse = verdict(case, solution(offset_free(case, flat)))
     assert worse.verdict is Verdict.ONE_PERIOD
 
@@ -169,7 +169,7 @@ def test_table_prints_null_hypotheses_before_bodies_and_the_verdict_last(cases):
 
 
 def test_residuals_of_twice_the_errors_are_never_certain(cases):
-    """The right periods, with light that misses by 2.3 times the errors in the mean."""
+    """The right periods, with residuals of 2.3 times the errors on average."""
     case = cases["tumbler"]
     curve = case[0]
     rng = np.random.default_rng(3)
@@ -195,7 +195,7 @@ def test_rivals_of_other_periods_are_ambiguous_and_other_poles_are_not(cases):
 
 
 def test_periods_that_a_few_nights_decide_are_ambiguous(cases):
-    """Odds of 1 in 10,000, but by one night: others are explained better by the other body."""
+    """Odds of 1 in 10,000 that depend on one night: the other body explains the others better."""
     case = cases["tumbler"]
     curve, _, linear, _ = case
     model = offset_free(case, tumbling)
@@ -214,7 +214,7 @@ def test_periods_that_a_few_nights_decide_are_ambiguous(cases):
 
 
 def test_refits_of_resampled_curves_are_weighted_least_squares():
-    """One step of Gauss and Newton is exact for a linear model without outliers."""
+    """One Gauss-Newton step is exact for a linear model without outliers."""
     rng = np.random.default_rng(0)
     block, derivatives = np.repeat(np.arange(6), 10), rng.normal(size=(60, 3))
     data, prior = rng.normal(size=60), np.diag([0.0, 0.5, 2.0])
@@ -232,12 +232,14 @@ def test_refits_of_resampled_curves_are_weighted_least_squares():
 
 
 def test_a_refit_gains_nothing_by_offsets_without_points_or_by_ending_early():
-    """A free offset of a block that is not drawn; a solution beside the least cost."""
+    """A free offset of a block that is not drawn; a solution that is not at the minimum of the
+    cost.
+    """
     rng = np.random.default_rng(1)
     block = np.repeat(np.arange(6), 10)
     offsets = (block[:, None] == np.arange(6)).astype(float)
     derivatives = np.hstack([rng.normal(size=(60, 2)), offsets])
-    residuals = 0.3 + rng.normal(size=60)  # the offsets are not those of the least cost
+    residuals = 0.3 + rng.normal(size=60)  # the offsets are not at the minimum of the cost
     none = np.zeros((8, 8)), np.zeros(8)
     weight = np.vstack([np.ones(6), [0, 2, 1, 1, 1, 1]]).astype(float)
     solution = _solutions.Linearised(residuals, derivatives, *none)
@@ -248,7 +250,7 @@ def test_a_refit_gains_nothing_by_offsets_without_points_or_by_ending_early():
 
 
 def test_periods_that_win_in_few_refits_are_ambiguous(cases):
-    """Two bodies that explain the points alike: which is the better depends on the nights."""
+    """Two bodies that fit equally well: which one is better depends on the nights."""
     case = cases["tumbler"]
     curve, _, linear, _ = case
     model = offset_free(case, tumbling)
@@ -279,7 +281,7 @@ def test_periods_that_win_in_few_refits_are_ambiguous(cases):
 
 
 def test_resampled_light_curves_count_the_priors_as_the_order_of_solutions_does(cases):
-    """A body that explains half of the nights better, by a shape that is all but excluded."""
+    """A body that fits half of the nights better, with a shape that the prior nearly excludes."""
     curve, _, linear, _ = cases["tumbler"]
     model = offset_free(cases["tumbler"], tumbling)
     part = np.where(curve.group % 2 == 0, 0.2, -0.2)
@@ -298,7 +300,9 @@ def test_resampled_light_curves_count_the_priors_as_the_order_of_solutions_does(
 
 
 def test_solutions_that_are_excluded_are_not_fitted_again(cases):
-    """One that the linear model would improve beyond the best, with odds of 1e-10 and of 1e-4."""
+    """Solutions that the linear model would improve beyond the best, with odds of 1e-10 and of
+    1e-4.
+    """
     case = cases["tumbler"]
     curve, _, linear, _ = case
     model = offset_free(case, tumbling)
@@ -329,7 +333,7 @@ def test_a_body_found_once_or_at_the_edge_of_the_search_is_ambiguous(cases):
 
 
 def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
-    """The best ellipsoid and the best convex body agree on the periods, not on the mode."""
+    """The best ellipsoid and the best convex body have the same periods, but different modes."""
     _, pairs, linear, nulls = cases["tumbler"]
     body = solution(offset_free(cases["tumbler"], tumbling))
     other = body._replace(mode=ph.Mode.SAM, model=body.model + 1e-3)
@@ -339,7 +343,7 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
         )
         assert found.verdict is expected
     assert "assumption on the shape" in found.reasons[0]
-    # unless convex bodies with the motion of the ellipsoid are excluded by far
+    # unless convex bodies with the ellipsoid's motion are clearly excluded
     for odds, expected in ((1e-5, Verdict.AMBIGUOUS), (1e-8, Verdict.TUMBLING)):
         rival = other._replace(probability=odds, model=body.model + 0.1)
         found = _verdict.judge(
@@ -349,14 +353,14 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
 
 
 def test_an_ellipsoid_whose_convex_body_is_excluded_does_not_make_a_result_ambiguous(cases):
-    """Its convex body is not in the list, which is cut at a number of solutions."""
+    """Its convex body is not in the list, whose length is limited."""
     _, pairs, linear, nulls = cases["tumbler"]
     body = solution(offset_free(cases["tumbler"], tumbling))
     ellipsoid = body._replace(P_psi=1.2 * P_PSI, model=body.model + 1e-3)
     for convex, expected in (
         (ellipsoid._replace(probability=1e-8), Verdict.TUMBLING),
         (ellipsoid._replace(probability=1e-4), Verdict.AMBIGUOUS),
-        (body, Verdict.TUMBLING),  # with a convex shape it has the best motion
+        (body, Verdict.TUMBLING),  # the best motion, with a convex shape
     ):
         found = _verdict.judge(
             linear,
@@ -372,7 +376,7 @@ def test_an_ellipsoid_whose_convex_body_is_excluded_does_not_make_a_result_ambig
 
 
 def test_the_evidence_for_tumbling_is_that_of_the_best_listed_body(cases):
-    """The first of the list fits better by parameters that are not worth it."""
+    """The first solution fits better, but by too little for its additional parameters."""
     case = cases["tumbler"]
     model = offset_free(case, tumbling)
     first, second = solution(model, parameters=60.0), solution(model + 1e-4, odds=0.5)
@@ -383,7 +387,9 @@ def test_the_evidence_for_tumbling_is_that_of_the_best_listed_body(cases):
 
 
 def test_a_body_that_is_no_better_than_a_series_of_two_periods_is_ambiguous(cases):
-    """Its parameters are not worth more than the lines, whose sums the series does not know."""
+    """A Fourier series, in which the lines are not combinations of two frequencies, has a similar
+    evidence.
+    """
     case = cases["tumbler"]
     model = offset_free(case, tumbling)
     plain = verdict(case, solution(model))
@@ -397,7 +403,7 @@ def test_a_body_that_is_no_better_than_a_series_of_two_periods_is_ambiguous(case
     assert "decisively better than a series of two periods" in reason
 
 
-@pytest.mark.slow  # the other verdicts: above
+@pytest.mark.slow  # faster: the other verdicts, above
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
@@ -411,7 +417,7 @@ def test_fourteen_points_are_too_few():
 
 
 def test_the_rotating_ellipsoid_is_found_with_its_geometry():
-    """Its light is not quite periodic, as directions turn; the ellipsoid explains all of it."""
+    """Its brightness is not periodic, since the directions change; the ellipsoid explains this."""
     axes, period = np.array([1.0, 0.6, 0.45]), 0.3
     blank = curve_of(flat, noise=0.0, days=40)
     state = ph.State([0.8, 0.4, -0.3, 0.2], [0, 0, 2 * np.pi / period])
@@ -442,7 +448,7 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
 
 
 def test_a_rotating_body_is_found_where_the_best_ellipsoid_has_another_period():
-    """Its light has strong odd harmonics, which no ellipsoid has."""
+    """Its light curve has strong odd harmonics, which no ellipsoid has."""
     period, blank = 0.42, curve_of(flat, noise=0.0)
     attitude = np.array([0.8, 0.4, -0.3, 0.2])
     state = ph.State(attitude / np.linalg.norm(attitude), [0, 0, 2 * np.pi / period])
@@ -502,7 +508,7 @@ def test_points_without_errors_get_the_scatter_of_neighbours():
 
 
 def test_precession_of_the_short_axis_is_counted_in_the_motion():
-    """Turns of the body's third axis about the momentum, in both modes."""
+    """Revolutions of the body's third axis about the momentum, in both modes."""
     inertia = ph.Inertia.from_moments([0.4, 0.8, 1.0])
     for omega in ([1.0, 0.2, 0.3], [0.2, 0.3, 1.0]):
         state = ph.State([1.0, 0, 0, 0], omega)
@@ -521,7 +527,7 @@ def test_precession_of_the_short_axis_is_counted_in_the_motion():
 
 @pytest.fixture(scope="module")
 def convex_case():
-    """A convex body that is no ellipsoid, seen in 12 nights, and its true motion."""
+    """A convex body that is not an ellipsoid, observed in 12 nights, and its true motion."""
     rng = np.random.default_rng(7)
     blank = curve_of(flat, nights=12, days=30, each=20)
     rough = 0.12 * rng.normal(size=16) * np.r_[0, np.ones(15)]
@@ -545,7 +551,7 @@ def convex_case():
     return curve, body, ph.periods(ph.Inertia(moments), state)
 
 
-@pytest.mark.slow  # of ellipsoids: test_fit
+@pytest.mark.slow  # faster: of ellipsoids, test_fit
 def test_derivatives_of_convex_bodies(convex_case):
     curve, body, _ = convex_case
     points = curve.points(0.0, 0.02)
@@ -571,7 +577,7 @@ def test_derivatives_of_convex_bodies(convex_case):
         e = size * np.eye(8)[k]
         measured = (value(e, none)[0] - value(-e, none)[0]) / (2 * size)
         scale = np.abs(measured).max()
-        # facets appear and vanish: single points differ
+        # facets become visible or dark: single points differ
         off = np.abs(motion[:, k] - measured) / scale
         assert np.median(off) < 1e-6
         assert np.quantile(off, 0.95) < 1e-2

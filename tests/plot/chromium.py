@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to over two pipes: opens a page, moves what is on it, looks at it."""
+"""A headless Chromium, controlled over two pipes: open a page, use its controls, read its image."""
 
 import base64
 import contextlib
@@ -28,18 +28,18 @@ _OPTIONS = (
 
 
 def find() -> str | None:
-    """The path of a Chromium or Chrome, None without one."""
+    """The path of Chromium or Chrome; None if there is none."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 class Browser:
-    """One tab. ``events`` are what the browser told without being asked."""
+    """One tab. ``events`` are unsolicited messages of the browser."""
 
     def __init__(self, program: str, profile: Path, size: tuple[int, int]):
         get, give_back = os.pipe()
         get_back, give = os.pipe()
         options = [*_OPTIONS, f"--user-data-dir={profile}", "--window-size={},{}".format(*size)]
-        # the browser reads what is asked on descriptor 3 and answers on descriptor 4
+        # the browser reads requests from descriptor 3 and writes responses to descriptor 4
         line = f'exec "$0" "$@" 3<&{get} 4>&{give}'
         self.process = subprocess.Popen(
             ["bash", "-c", line, program, *options, "about:blank"],
@@ -83,7 +83,7 @@ class Browser:
         return json.loads(line)
 
     def run(self, script: str):
-        """The value of an expression in the page; a promise is waited for."""
+        """The value of an expression in the page; waits for a promise."""
         found = self.ask(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
@@ -98,7 +98,7 @@ class Browser:
         self.wait(f"document.readyState === 'complete' && location.href === {address!r}")
 
     def wait(self, condition: str, seconds: float = 180.0) -> None:
-        """Until the expression is true."""
+        """Wait until the expression is true."""
         end = time.monotonic() + seconds
         while not self.run(condition):
             if time.monotonic() > end:
@@ -106,16 +106,16 @@ class Browser:
             time.sleep(0.05)
 
     def look(self) -> np.ndarray:
-        """What the page shows, (rows, columns, 3) from 0 to 1."""
+        """Image of the page, (rows, columns, 3) from 0 to 1."""
         from matplotlib.image import imread
 
         twice = "new Promise(r => requestAnimationFrame(() => requestAnimationFrame(() => r(1))))"
-        self.run(twice)  # what was asked for has been drawn
+        self.run(twice)  # wait until the frame is drawn
         picture = base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
         return imread(io.BytesIO(picture), format="png")[..., :3]
 
     def box(self, selector: str) -> tuple[slice, slice]:
-        """Where an element is in the picture: rows, columns."""
+        """Position of an element in the image: rows, columns."""
         place = f"document.querySelector({selector!r}).getBoundingClientRect().toJSON()"
         found = {name: round(value) for name, value in self.run(place).items()}
         return slice(found["top"], found["bottom"]), slice(found["left"], found["right"])
@@ -128,7 +128,7 @@ class Browser:
 
     @property
     def requests(self) -> list[str]:
-        """Addresses that the page asked for since it was opened."""
+        """Addresses that the page requested since it was opened."""
         sent = [e for e in self.events if e.get("method") == "Network.requestWillBeSent"]
         return [event["params"]["request"]["url"] for event in sent]
 
@@ -147,7 +147,7 @@ class Browser:
 
 @contextlib.contextmanager
 def opened(program: str, profile: Path, size: tuple[int, int] = (720, 480)) -> Iterator[Browser]:
-    """A browser that ends with the block."""
+    """Context manager for a browser."""
     browser = Browser(program, profile, size)
     try:
         yield browser

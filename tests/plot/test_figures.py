@@ -1,4 +1,4 @@
-"""Figures draw what they say; bad input is named; the user's settings stay as they are."""
+"""Figures show the right data; wrong input raises errors; the user's settings do not change."""
 
 import sys
 
@@ -249,7 +249,7 @@ def test_message_without_matplotlib(trajectory, monkeypatch):
 
 
 def test_momentum_is_that_of_body_and_wheels():
-    """The drift of a body with a wheel is rounding, and the herpolhode lies in its own plane."""
+    """With wheels the momentum is constant to rounding, and the herpolhode is in one plane."""
     wheel = ph.Rotor([0.0, 0.0, 1.0], momentum=3.0)
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), rotors=wheel)
     state = ph.State([1.0, 0, 0, 0], [0.1, 1.0, 0.2])

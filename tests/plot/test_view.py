@@ -1,4 +1,4 @@
-"""The page of moving bodies: it holds the motion, stands alone, and shows it in a browser."""
+"""The HTML page of moving bodies: contains the motion, needs no network, runs in a browser."""
 
 import base64
 import json
@@ -15,11 +15,11 @@ from polhode import plot
 from polhode.plot import _view
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
-TURN = 2 * np.pi  # s: one turn of the spinning body
+TURN = 2 * np.pi  # period of the spinning body [s]
 
 
 def known(page: plot.View) -> dict:
-    """What the page knows, its arrays decoded."""
+    """Data of the page, with decoded arrays."""
     text = re.search(r'<script id="motion"[^>]*>(.*?)</script>', page.html, re.S)[1]
     motion = json.loads(text)
     for body in motion["bodies"]:
@@ -36,7 +36,7 @@ def decoded(text: str, dtype: str = "<f4") -> np.ndarray:
 
 
 def spinning(samples: int, end: float, tensor=None, start: float = 0.0) -> plot.Samples:
-    """A body that turns about its own and space's z axis, 1 rad/s."""
+    """A body that rotates about its own and space's z axis at 1 rad/s."""
     ts = np.linspace(start, end, samples)
     half = (ts - start) / 2
     wxyz = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
@@ -46,7 +46,7 @@ def spinning(samples: int, end: float, tensor=None, start: float = 0.0) -> plot.
 
 @pytest.fixture(scope="module")
 def trajectory():
-    """Two free bodies, exact."""
+    """Two free bodies in closed form."""
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
     omega = jnp.array([[0.01, 1.0, 0.01], [1.0, 0.3, 0.1]])
     return ph.simulate(scene, ph.State(wxyz=[1.0, 0, 0, 0], omega_body=omega), [10.0, 10.5, 12.0])
@@ -76,7 +76,7 @@ def test_momentum_of_wheels_is_shown():
     body = motion["bodies"][0]
     np.testing.assert_allclose(body["momentum_space"], moved.momentum_space, rtol=1e-6)
     assert body["momentum_space"][0, 2] > 5
-    # the momentum stays, but the ellipsoid does not roll on the plane normal to it
+    # the momentum is constant, but the ellipsoid does not roll on the plane normal to it
     assert np.ptp(body["momentum_space"], axis=0).max() < 1e-5
     assert motion["plane"] == "tangent plane"
 
@@ -217,7 +217,7 @@ def browser(tmp_path_factory):
 
 
 def at(browser, seconds: float) -> np.ndarray:
-    """The page's picture of the body with the slider at a time."""
+    """Image of the body with the slider at a time."""
     browser.run(
         f"(s => {{ s.value = {seconds}; s.dispatchEvent(new Event('input')); }})"
         "(document.getElementById('time'))"
@@ -228,7 +228,7 @@ def at(browser, seconds: float) -> np.ndarray:
 
 
 def changed(one: np.ndarray, other: np.ndarray) -> float:
-    """Share of the pixels that differ visibly."""
+    """Fraction of the pixels that differ visibly."""
     return float((np.abs(one - other).max(axis=-1) > 0.1).mean())
 
 
@@ -246,7 +246,7 @@ def test_a_browser_shows_the_body_and_the_slider_moves_it(browser, tmp_path):
     quarter = at(browser, 1.0 + TURN / 4)
     assert browser.run("document.getElementById('readout').textContent") == "t = 2.57 s"
     assert changed(first, quarter) > 0.01
-    # a whole turn later everything is where it was
+    # after a full turn the picture is the same
     assert changed(first, at(browser, 1.0 + TURN)) < 0.002
     assert changed(first, at(browser, 1.0)) == 0
     assert not browser.faults
@@ -258,7 +258,7 @@ def test_a_browser_plays_and_hides(browser, trajectory, tmp_path):
     plot.view(trajectory, page, names=["first", "second"])
     browser.open(page.as_uri())
     time = "Number(document.getElementById('time').value)"
-    browser.wait(f"{time} > 0.2")  # it plays by itself
+    browser.wait(f"{time} > 0.2")  # it starts automatically
     browser.run("document.getElementById('play').click()")
     stopped = browser.run(time)
     shown = browser.look()
@@ -276,6 +276,6 @@ def test_a_browser_plays_and_hides(browser, trajectory, tmp_path):
 
 
 def test_a_page_carries_the_licence_of_what_it_carries(trajectory):
-    """three.js may be passed on with its copyright notice and the text of its licence."""
+    """The licence of three.js requires its copyright notice and the licence text."""
     licence = Path(plot.__file__).parent / "viewer" / "three.LICENSE.txt"
     assert licence.read_text(encoding="utf-8").strip() in plot.view(trajectory).html

@@ -1,4 +1,4 @@
-"""Document 002: the matrix K, its relations to R, its axis-angle formulas, published truth."""
+"""Document 002: the matrix K, its relation to R, its axis-angle formulas, published values."""
 
 import jax
 import jax.numpy as jnp

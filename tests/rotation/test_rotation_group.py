@@ -13,7 +13,7 @@ SHAPE = (3, 1, 2, 1)
 
 
 def _samples(shape, seed, dtype=np.float64):
-    """Unit quaternions: random ones, some next to the identity or to a half turn."""
+    """Unit quaternions: random ones, some close to the identity or to a half turn."""
     rng = np.random.default_rng(seed)
     angles = rng.choice([0.0, 1e-9, 1e-3, 1.0, 2.5, np.pi - 1e-9, np.pi], (*shape, 1))
     axes = rng.normal(size=(*shape, 3))
@@ -155,14 +155,14 @@ def test_derivatives_at_the_identity_are_right():
 
 @pytest.mark.parametrize("scale", [1e-18, 1e18])
 def test_the_derivative_of_a_rotation_vector_follows_the_scale(scale):
-    """Of quaternions in single precision, powers of whose length would overflow."""
+    """For quaternions in single precision, powers of whose length would overflow."""
     wxyz = jnp.array([0.1, -0.5, 0.3, 0.8], jnp.float32)
     slopes = jax.jit(jax.jacfwd(rotation.wxyz_to_rotation_vector))
     np.testing.assert_allclose(scale * slopes(scale * wxyz), slopes(wxyz), rtol=2e-6)
 
 
 def test_an_euler_angle_gradient_is_smooth_at_no_rotation():
-    """From ZYZ angles at theta = 0 to the rotation vector and back to a scalar: no NaN, right."""
+    """From ZYZ angles at theta = 0 to the rotation vector and to a scalar: right, and not NaN."""
     jacobian = jax.jacrev(rotation.euler_to_rotation_vector, argnums=(0, 1, 2))
     columns = np.stack(jax.jit(jacobian)(0.0, 0.0, 0.0), axis=-1)
     np.testing.assert_allclose(columns, [[0, 0, 0], [0, 1, 0], [1, 0, 1]], atol=1e-16)

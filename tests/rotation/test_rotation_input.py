@@ -1,4 +1,4 @@
-"""What is no rotation is refused where it is known, and never read as another rotation."""
+"""Invalid rotations are rejected if they are not traced, and never read as other rotations."""
 
 import jax
 import jax.numpy as jnp
@@ -113,7 +113,7 @@ def test_known_matrices_are_looked_at_inside_jit():
 
 
 def test_quaternions_whose_squares_are_no_numbers_are_seen():
-    """Squares of 1e-200 vanish, those of 1e200 are infinite."""
+    """Squares of 1e-200 underflow, those of 1e200 overflow."""
     for size in (1e-200, 1e200):
         np.testing.assert_allclose(
             rotation.normalise([size, 0, 0, size]), [0.5**0.5, 0, 0, 0.5**0.5]

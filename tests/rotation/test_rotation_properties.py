@@ -1,4 +1,4 @@
-"""Properties of rotations over six decades of angle and next to the singular attitudes."""
+"""Properties of rotations over six decades of angle and near the singular attitudes."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def quaternion(drawn, dtype):
 
 @jax.jit
 def group(a, b, vector):
-    """Pairs that are equal."""
+    """Pairs of expressions that must be equal."""
     multiply, rotate, matrix = rotation.multiply, rotation.rotate, rotation.wxyz_to_matrix
     one = rotation.identity((), a.dtype)
     return (
@@ -60,7 +60,7 @@ def test_composition_and_inverse(dtype, first, second, vector):
 
 @jax.jit
 def round_trips(wxyz):
-    """The attitude through every description of it."""
+    """The attitude converted to every representation and back."""
     back = [
         rotation.axis_angle_to_wxyz(*rotation.wxyz_to_axis_angle(wxyz)),
         rotation.rotation_vector_to_wxyz(rotation.wxyz_to_rotation_vector(wxyz)),

@@ -42,7 +42,7 @@ def test_agreement_with_scipy_and_round_trip(sequence):
     matrix, back = both(*jnp.asarray(angles))
     theirs = Rotation.from_euler(_scipy_name(sequence), angles.T)
     np.testing.assert_allclose(matrix, theirs.as_matrix(), rtol=0, atol=2e-15)
-    # near an end of the range the outer angles are known to eps/sin only
+    # near an end of the range the error of the outer angles is eps/sin
     np.testing.assert_allclose(np.stack(back), angles, rtol=0, atol=1e-13)
     np.testing.assert_allclose(np.stack(back).T, theirs.as_euler(_scipy_name(sequence)), atol=1e-12)
 

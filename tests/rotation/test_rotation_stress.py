@@ -1,4 +1,4 @@
-"""Every conversion against 120-digit arithmetic: the stress table with few random samples."""
+"""Every conversion against 120-digit arithmetic: the stress test with few random samples."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from benchmarks import rotation_cases, rotation_stress
 from polhode.rotation import Sequence
 
-# value: the promised bound; derivatives: worst of the full table, times about two
+# value: the documented bound; derivatives: about twice the maximum of the full table
 BOUNDS = {"value": 4.0, "first": 12.0, "second": 24.0}
 CASES = rotation_cases.plain_cases(4)
 for _sequence in (Sequence.ZYZ, Sequence.ZXY_SPACE):

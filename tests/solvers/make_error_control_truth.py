@@ -1,10 +1,10 @@
 """Writes error_control_truth.json: ``python tests/solvers/make_error_control_truth.py``, an hour.
 
-Random bodies under uniform gravity or the pull of a resting centre, over six decades of moments,
-rates, fields and angles, with their last states. These are found by an extrapolated midpoint rule
-of order 20 in the long double of numpy (18 digits or more), written here for itself, twice, in
-steps of different length. Bodies whose motion spreads an error by more than 30 times the angle are
-left out, and so are such whose two ends differ by more than 1e-13 rad.
+Random bodies under uniform gravity or the attraction of a fixed centre, over six decades of
+moments, rates, fields and angles, with their last states. An extrapolated midpoint rule of order
+20, implemented here in NumPy's long double (18 digits or more), computes them twice with different
+steps. Bodies whose errors grow more than 30 times as fast as the angle are excluded, and so are
+those whose two results differ by more than 1e-13 rad.
 """
 
 import json
@@ -19,7 +19,7 @@ SUBSTEPS = (2, 4, 6, 8, 10, 12, 14, 16, 24, 36)
 COUNT, TRIED, SEED = 40, 60, 7
 DRAWN = {"gravity": 400, "gradient": 300}
 STEPS_PER_RADIAN = (4.5 / 4 / 0.4, 4.5 / 4 / 0.33)
-ISSUE = {  # a fast body in weak gravity, missed 40 times by steps of one length
+ISSUE = {  # a fast body in weak gravity; constant steps had errors of 40 rtol
     "moments": (0.185374890313552, 0.13598723203931942, 0.0827285151911606),
     "mass": 0.3685115258930283,
     "centre": (0.04258271457322926, 0.03552958728962913, -0.027113658794491458),
@@ -76,7 +76,7 @@ def field(kind, body, y):
 
 
 def last_state(kind, body, density, nudge=None):
-    """State (7, N) at the end, in ``density`` steps for every radian."""
+    """State (7, N) at the end, in ``density`` steps per radian."""
     body = {name: np.asarray(x, LONG) for name, x in body.items()}
     wxyz = body["wxyz"] / np.sqrt(np.sum(body["wxyz"] ** 2, axis=0))
     momentum = body["moments"] * body["omega"]
@@ -108,14 +108,14 @@ def one_step(kind, body, y, width):
 
 
 def angle(a, b):
-    """Between the attitudes of states (7, N) [rad]."""
+    """Angles [rad] between the attitudes of states (7, N)."""
     sign = np.where(np.sum(a[3:] * b[3:], axis=0) < 0, -1, 1)
     chord = np.sqrt(np.sum((a[3:] - sign * b[3:]) ** 2, axis=0))
     return (4 * np.arcsin(np.minimum(1, chord / 2))).astype(float)
 
 
 def draw(kind, count, seed):
-    """Bodies (..., N); ``angle``: in units of the faster of spin and libration [rad]."""
+    """Bodies (..., N); ``angle`` [rad]: of the faster of spin and libration."""
     rng = np.random.default_rng(seed)
 
     def decades(low, high):
@@ -147,7 +147,7 @@ def draw(kind, count, seed):
 
 
 def judged(kind, body, seed):
-    """Last state of every body, whether it is known well, how much its motion spreads errors."""
+    """Last state of every body, whether it is accurate, and the growth of errors."""
     coarse, fine = (last_state(kind, body, density) for density in STEPS_PER_RADIAN)
     away = np.random.default_rng(seed).normal(size=coarse[:3].shape)
     nudge = 1e-10 * away / np.linalg.norm(away, axis=0)
@@ -157,7 +157,7 @@ def judged(kind, body, seed):
 
 
 def listed(body, end):
-    """One entry a body, of its numbers and of its last state."""
+    """One entry per body, with its numbers and its last state."""
     last = {"momentum_end": end[:3].astype(float), "wxyz_end": end[3:].astype(float)}
     return {name: x.T.tolist() for name, x in (body | last).items()}
 
@@ -186,7 +186,7 @@ def main():
 
 
 def issue():
-    """The body that is given, as a batch of one."""
+    """One given body, as a batch of one."""
     turned = np.linalg.norm(ISSUE["omega"]) * abs(ISSUE["end"])
     return {name: np.array(x)[..., None] for name, x in (ISSUE | {"angle": turned}).items()}
 

@@ -1,8 +1,8 @@
 """Writes integrators_truth.json: ``python tests/solvers/make_integrators_truth.py`` (a minute).
 
 Three bodies under one weight, by Taylor series in 40-digit arithmetic: states at some times, and
-the slopes of a weighted sum of the last state with respect to the first moment of inertia and to
-the strength of the field, by central differences.
+the derivatives of a weighted sum of the last state with respect to the first moment of inertia and
+to the strength of the field, by central differences.
 """
 
 import json
@@ -29,7 +29,7 @@ def momenta(state, moments):
 
 
 def weighted(moments, strength):
-    """Sum over the bodies of the weighted last state; the first momenta are given."""
+    """Weighted sum of the last states of the bodies; the initial momenta are constant."""
     total = mpmath.mpf(0)
     for q, w in zip(WXYZ, OMEGA):
         omega = [mpmath.mpf(m * r) / mpmath.mpf(i) for m, r, i in zip(MOMENTS, w, moments)]

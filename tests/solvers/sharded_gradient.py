@@ -1,6 +1,6 @@
-"""Run by the tests with 2 host devices: gradients of a sharded batch beside one device, as JSON.
+"""Script for tests with 2 host devices: gradients of a sharded batch and of one device, as JSON.
 
-Words after the name of the script: which scenes.
+Arguments: the scenes.
 """
 
 import json

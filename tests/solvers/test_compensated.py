@@ -1,4 +1,4 @@
-"""Steps that carry along what rounding takes from them."""
+"""Integration steps with compensated summation of rounding errors."""
 
 from functools import cache, partial
 
@@ -14,7 +14,7 @@ from polhode._integrate import Accuracy
 
 
 def _tops(dtype):
-    """Heavy tops in components, moving slowly against their steps; single precision holds all."""
+    """Heavy tops by components, slow compared with their steps; exact in single precision."""
     moments = jnp.array([[1.0, 1.5, 2.0], [2.0, 1.0, 1.5], [1.0, 1.25, 0.5]], dtype)
     numbers = (jnp.array(x, dtype) for x in (0.0625, (0.125, 0.0, 0.5), (0.0, 0.0, -1.0)))
     scene = ph.Scene(ph.Inertia.from_moments(moments), ph.UniformGravity(*numbers))
@@ -25,7 +25,7 @@ def _tops(dtype):
 
 
 def _marched(dynamics, y, compensated):
-    """By the solver's own march from each of 401 times to the next."""
+    """By the solver's own integration from each of 401 times to the next."""
     ends = jnp.linspace(0.0, 40.0, 401, dtype=y[0][0].dtype)
     solver = ph.Extrapolation(10, compensated=compensated, accuracy=Accuracy(1e-7, 40.0))
     return _solved(dynamics, y, solver, None, diffrax.StepTo(ends))
@@ -55,7 +55,7 @@ def _exact():
     ],
 )
 def test_compensated_steps_lose_less_to_rounding(run):
-    """Single precision against double; over 400 steps plain ones lose 10 to 40 times more."""
+    """Single against double precision; over 400 steps, plain ones have 10 to 40 times the error."""
     exact, lost = _exact(), []
     for compensated in (False, True):
         end = jax.jit(partial(run, compensated=compensated))(*_tops(jnp.float32))
@@ -66,7 +66,9 @@ def test_compensated_steps_lose_less_to_rounding(run):
 
 
 def test_a_driven_body_keeps_a_tolerance_near_rounding():
-    """900 rad about z, at the rate 3 + 0.05 sin(t): explicit steps would lose 1e-12 by rounding."""
+    """900 rad about z, at the rate 3 + 0.05 sin(t): explicit steps would have a rounding error
+    above 1e-12.
+    """
 
     def drive(t, wxyz, omega):
         return jnp.array([0.0, 0.0, 0.05]) * jnp.cos(t)

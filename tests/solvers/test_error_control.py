@@ -1,6 +1,6 @@
-"""The error asked for is the error reached: random bodies over six decades, the planner's method.
+"""Errors stay within the requested tolerance: random bodies over six decades, default method.
 
-Truth by an integrator of its own in long double, see ``make_error_control_truth.py``.
+The reference is an independent integrator in long double: ``make_error_control_truth.py``.
 """
 
 import json
@@ -39,7 +39,7 @@ def run(kind, dtype, rtol, method=None):
 
 @cache
 def exact(kind, rounded):
-    """Last attitudes: the truth, or what float64 at 1e-12 makes of the rounded input."""
+    """Last attitudes: the reference, or the result of float64 at 1e-12 for the rounded input."""
     if not rounded:
         return MADE[kind]["wxyz_end"]
     made = {name: jnp.asarray(x, jnp.float32) for name, x in MADE[kind].items()}
@@ -58,14 +58,14 @@ def errors(found, wxyz):
     "kind", [k if k == "gravity" else pytest.param(k, marks=pytest.mark.slow) for k in MADE]
 )
 def test_no_body_is_far_beyond_the_error_asked_for(kind):
-    """Nor is the work of steps much finer than asked for done."""
+    """And the steps are not much smaller than necessary."""
     assert len(MADE[kind]["end"]) >= COUNT
     for rtol in (1e-3, 1e-6, 1e-9, 1e-12):
         found = run(kind, jnp.float64, rtol)
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = errors(found, exact(kind, False))
         assert np.max(off) < 10 * rtol, (rtol, np.argmax(off), np.max(off) / rtol)
-        usual = np.median(off[MADE[kind]["angle"] > 10])  # the way of several steps
+        usual = np.median(off[MADE[kind]["angle"] > 10])  # several steps
         assert 0.01 * rtol < usual < 3 * rtol, (rtol, usual / rtol)
 
 
@@ -73,14 +73,14 @@ def test_no_body_is_far_beyond_the_error_asked_for(kind):
     "kind", [k if k == "gravity" else pytest.param(k, marks=pytest.mark.slow) for k in MADE]
 )
 def test_nor_in_single_precision(kind):
-    """Up to what rounding takes, beside float64 on the same rounded numbers."""
+    """Up to rounding, against float64 with the same rounded numbers."""
     for rtol in (1e-3, 1e-4, 1e-5):
         found = run(kind, jnp.float32, rtol)
         assert found.wxyz.dtype == jnp.float32
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = errors(found, exact(kind, True))
         angle = MADE[kind]["angle"]
-        lost = 6 * np.finfo(np.float32).eps * np.maximum(angle, 1)  # rounding turns a body on
+        lost = 6 * np.finfo(np.float32).eps * np.maximum(angle, 1)  # rounding errors accumulate
         assert np.all(off < 10 * (rtol + lost)), (rtol, np.max(off / (rtol + lost)))
         assert np.median(off) > 0.005 * rtol
         assert np.all(off[angle < 10] < 10 * rtol), (rtol, np.max(off[angle < 10] / rtol))
@@ -88,10 +88,11 @@ def test_nor_in_single_precision(kind):
 
 
 @pytest.mark.parametrize(("kind", "count"), [("top", 600), ("gradient", 3)])
-@pytest.mark.slow  # the last time: above
+@pytest.mark.slow  # faster: the last time, above
 def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
-    """Bodies of a batch go on to their next saved times without waiting for others, in steps of an
-    order for the way between these."""
+    """Bodies of a batch proceed to their next saved times independently, with an order of the steps
+    that suits the distance between these.
+    """
     rng = np.random.default_rng(count)
     moments = 10 ** rng.uniform(0, 1, (100, 1)) * rng.uniform(1, 1.9, (100, 3))
     if kind == "top":
@@ -110,11 +111,11 @@ def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = np.max(np.asarray(rotation.angle_between(found.wxyz, fine.wxyz)), axis=1)
         assert np.max(off) < 10 * rtol, (rtol, np.max(off) / rtol)
-        assert np.max(off) > 1e-3 * rtol or count == 600  # whose steps are short
+        assert np.max(off) > 1e-3 * rtol or count == 600  # which has short steps
 
 
 def test_few_steps_of_a_body_that_comes_to_rest_are_refused():
-    """It turns ever less in a step, whose error is rounding in the end."""
+    """It rotates ever less in a step, whose error is finally that of rounding."""
     rng = np.random.default_rng(3)
     state = ph.State(rng.normal(size=(16, 4)), rng.normal(size=(16, 3)))
     torque = ph.FeedbackTorque(lambda t, wxyz, omega: -30 * omega)
@@ -124,7 +125,9 @@ def test_few_steps_of_a_body_that_comes_to_rest_are_refused():
 
 
 def test_a_wheel_keeps_the_tolerance_through_its_band_of_friction():
-    """At every ``rtol``: without a third estimate steps that pass the band have errors of 100."""
+    """At every ``rtol``: without a third estimate, steps across the band have errors of 100
+    ``rtol``.
+    """
     friction = ph.CoulombFriction(0.0443, 0.00164)
     wheel = ph.Rotor([0.606, 0.751, 0.261], inertia=1060.0, speed=0.0152, coupling=friction)
     scene = ph.Scene(ph.Inertia.from_moments([6503.0, 15672.0, 11624.0]), rotors=wheel)

@@ -1,6 +1,6 @@
-"""Derivatives of the exact flow, forward and reverse, of any solver, in ``simulate`` and outside.
+"""Derivatives of the exact flow, forward and reverse, with any solver, in ``simulate`` and outside.
 
-Against differences of the values, slopes of 40 digits, and motions known in closed form.
+Against differences of the values, 40-digit derivatives, and motions in closed form.
 """
 
 import json
@@ -35,7 +35,7 @@ METHOD = ph.LiePoisson(Extrapolation(12), chunk=2)  # chunks smaller than the ba
 
 
 def driven(p):
-    """Gravity, a torque that depends on time through what it closes over, drag that stops it."""
+    """Gravity, a torque that depends on time and on closed-over values, and strong drag."""
     push = ph.BodyTorque(lambda t: jnp.stack([jnp.sin(p["rate"] * t), 0 * t, p["rate"] + 0 * t]))
     weight = ph.UniformGravity(p["rate"], p["centre"], 0 * p["centre"] - 2)
     drag = ph.LinearDamping(8 * p["centre"])
@@ -43,8 +43,9 @@ def driven(p):
 
 
 def loss(p):
-    """Of three saved states, of all bodies, of the work (which takes the equations of any field for
-    the slopes); ``last`` moves the times."""
+    """Of three saved states, of all bodies, and of the work (which requires the equations of any
+    field for the derivatives); ``last`` shifts the times.
+    """
     scene, state = driven(p), ph.State(p["wxyz"], p["omega"])
     ts = jnp.stack([0.2 * p["last"], p["last"] / 2, p["last"]])
     end = ph.simulate(scene, state, ts, METHOD, rtol=1e-12, record=ph.Record(work=True))
@@ -90,7 +91,7 @@ def test_both_modes_are_the_slope():
     slopes = jax.jit(jax.grad(fn))(p)
     products = jax.tree.map(lambda s, d: jnp.sum(s * d), slopes, direction)
     np.testing.assert_allclose(sum(jax.tree.leaves(products)), want, rtol=1e-9)
-    assert all(abs(float(x)) > 1e-6 for x in jax.tree.leaves(products))  # every one takes part
+    assert all(abs(float(x)) > 1e-6 for x in jax.tree.leaves(products))  # all have an effect
     np.testing.assert_allclose(both(p, direction)[1], want, rtol=1e-9)
 
 
@@ -122,7 +123,7 @@ def value(inverse):
 
 
 def test_an_array_as_long_as_the_batch_is_one_that_the_bodies_share():
-    """The moment (3,) of a magnet in three bodies, of which each takes steps of its own."""
+    """The moment (3,) of a magnet in three bodies, each of which has its own steps."""
     inertia, field = ph.Inertia.from_moments([1.0, 1.5, 2.0]), jnp.array([0.0, 0.0, 0.5])
     state = ph.State(
         jnp.tile(jnp.array([0.9, 0.1, 0.4, 0.1]), (3, 1)),
@@ -145,7 +146,7 @@ def test_an_array_as_long_as_the_batch_is_one_that_the_bodies_share():
 
 @pytest.mark.slow
 def test_batches_of_slopes():
-    """vmap over gradients, Jacobians both ways."""
+    """vmap over gradients, Jacobians in both modes."""
     point = 1 / MOMENTS.T
     slopes = jax.jit(jax.vmap(jax.grad(value)))(jnp.stack([point, 1.1 * point]))
     forward = jax.jit(jax.vmap(jax.jacfwd(value)))(jnp.stack([point, 1.1 * point]))
@@ -155,7 +156,7 @@ def test_batches_of_slopes():
 @pytest.mark.parametrize("kind", ["exact equations", "recorded steps"])
 @pytest.mark.parametrize("inner", [jax.jacrev, jax.jacfwd])
 def test_reverse_mode_of_a_derivative_says_what_to_take(kind, inner):
-    """JAX would say that its own loops cannot be differentiated; of closed forms it is right."""
+    """The error names jax.hessian, not JAX's loops; for closed forms reverse mode works."""
     torque = ph.FeedbackTorque(lambda t, wxyz, omega: -jnp.maximum(omega, 0))
     pull = ph.UniformGravity(1.0, [0.1, 0.0, 0.5])
     acts = {"exact equations": (pull,), "recorded steps": (None, torque)}[kind]
@@ -170,7 +171,7 @@ def test_reverse_mode_of_a_derivative_says_what_to_take(kind, inner):
 
 @pytest.mark.slow
 def test_second_derivatives_of_chunks():
-    """Of bodies moved one chunk after another: the Hessian is that of one chunk, and symmetric."""
+    """For bodies in several chunks the Hessian is that of one chunk, and symmetric."""
     state, push = ph.State(WXYZ, OMEGA), ph.BodyTorque([0.1, 0.0, -0.2])
 
     def loss(x, chunk):
@@ -234,8 +235,9 @@ def arguments(first, strength):
 @pytest.mark.parametrize("name", SOLVES)
 @pytest.mark.slow
 def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
-    """Of the last state by a moment and the strength of the field, 40 digits; the steps of the
-    implicit one are coarse, its derivatives are not."""
+    """Of the last state with respect to a moment and the strength of the field, 40 digits; the
+    steps of the implicit solver are coarse, its derivatives are not.
+    """
 
     def loss(p):
         last = solved(name, arguments(*p), jnp.array([0.75, END]))[:, -1]
@@ -243,7 +245,7 @@ def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
 
     p = jnp.array([bodies.MOMENTS[0], bodies.STRENGTH])
     want = [float(x) for x in TRUTH["slopes"]]
-    rtol = 1e-4 if name == "implicit" else 1e-10  # it starts backwards from its own end
+    rtol = 1e-4 if name == "implicit" else 1e-10  # backward from the computed end
     both = jax.jit(lambda p: (jax.jacrev(loss)(p), jax.jacfwd(loss)(p)))(p)
     for slopes in both:
         np.testing.assert_allclose(slopes, want, rtol=rtol)
@@ -252,7 +254,7 @@ def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
 
 @pytest.mark.parametrize("end", [0.5, -0.5])
 def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
-    """Of two times nothing is looped; rooms for more steps stay as they are."""
+    """With two times there is no loop; entries for further steps do not change."""
     ts = jnp.array([0.0, end])
     subs = [
         diffrax.SubSaveAt(t0=True, steps=1),
@@ -284,7 +286,7 @@ def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
 
 @pytest.mark.slow
 def test_slopes_by_saved_times_are_the_field():
-    """At each of them; a later start alone is an earlier end."""
+    """At each of them; a later start alone equals an earlier end."""
     args, ts = arguments(jnp.array(bodies.MOMENTS[0]), jnp.array(bodies.STRENGTH)), bodies.TIMES
     ts = jnp.array([t for t in ts if t not in (0.1, 1.0)])
 
@@ -306,7 +308,7 @@ def test_slopes_by_saved_times_are_the_field():
 
 
 def drawn_together(t, y, args):
-    """The angle x and the rate v of what is pushed and dragged: v' = a (c^2 - v^2)."""
+    """Angle x and rate v under a constant torque and quadratic drag: v' = a (c^2 - v^2)."""
     _, v = y
     a, c = args
     return v, a * (c**2 - v**2)
@@ -315,7 +317,9 @@ def drawn_together(t, y, args):
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 @pytest.mark.slow
 def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
-    """Like exp(-28): in one part the start would be found with exp(28) times the rounding."""
+    """States converge like exp(-28): backward in one part, rounding of the start would grow by
+    exp(28).
+    """
     span = 4.0
 
     def exact(p):
@@ -348,7 +352,7 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
     found = [jax.jit(mode(partial(angle, intervals=n)))(p) for n in (1, 8)]
     np.testing.assert_allclose(found[1], want, rtol=1e-9)
     if mode is jax.jacrev:
-        assert np.isnan(found[0]).all()  # what the saved times are for
+        assert np.isnan(found[0]).all()  # without the saved times it is NaN
 
 
 @pytest.mark.parametrize(
@@ -363,9 +367,10 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
     ],
 )
 def test_a_damped_batch_is_followed_back(n, times, final_only, pulsed):
-    """Spheres that stop like exp(-28), by a gain that the torque closes over; a plain call takes
-    no step more for it. ``pulsed``: with edges in the program. Of more bodies than SIMD lanes the
-    program takes twice as long to compile."""
+    """Spheres that stop like exp(-28), with a gain that the torque closes over; an ordinary call
+    takes no additional step. ``pulsed``: with edges in the program. With more bodies than SIMD
+    lanes the program would take twice as long to compile.
+    """
     ts = jnp.array(times)
     omega = 1 + jax.random.uniform(jax.random.key(1), (n, 3))
     state = ph.State(jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (n, 4)), omega)
@@ -420,7 +425,7 @@ reverse = jax.jit(jax.value_and_grad(total_rate), static_argnums=2)
     ids=["few", "reverse", "forward"],
 )
 def test_a_span_of_few_units_in_the_last_place_is_followed_back(n, both, ts):
-    """Single precision resolves a 128th of a second there: no room for restarts."""
+    """Single precision resolves a 128th of a second there: restarts are impossible."""
     ts, gain = jnp.array(ts, jnp.float32), jnp.float32(0.5)
     value, slope = both(gain, ts, n)
     span = ts[1] - ts[0]
@@ -462,9 +467,10 @@ DRIVEN = {
 
 
 def held(p, method):
-    """Of a body that a torque drives about its z axis and drag holds to one rate: law known.
+    """A body that a torque drives about its z axis to the terminal rate of its drag, in closed
+    form.
 
-    Whatever the start, it forgets it like exp(-28).
+    It forgets the initial state like exp(-28).
     """
     along = jnp.array([0.0, 0.0, 1.0])
     inertia = ph.Inertia.from_moments(jnp.array([0.8, 1.0, 0.0]) + along * p["moment"])
@@ -477,7 +483,7 @@ def held(p, method):
 
 @pytest.mark.slow  # the parts themselves: test_parts_keep_the_way_back_from_states_drawn_together
 def test_the_way_back_starts_anew_where_drag_draws_bodies_together():
-    """By itself, in ``simulate``."""
+    """By default, in ``simulate``."""
     method = ph.LiePoisson(Extrapolation(12))
     exact = jax.grad(held)(DRIVEN, ph.FixedAxis())
     found = jax.grad(held)(DRIVEN, method)
@@ -490,7 +496,7 @@ def test_the_way_back_starts_anew_where_drag_draws_bodies_together():
 
 
 def test_linear_maps_transpose_by_the_other_program():
-    """Zeros, known operands and batches included."""
+    """Including zeros, constant operands and batches."""
 
     def product(a, x, y):
         forward = lambda given, v: [given[0] @ v[0] + v[1]]  # noqa: E731

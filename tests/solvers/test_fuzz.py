@@ -1,5 +1,7 @@
-"""A part of the fuzz of all parts (`benchmarks/fuzz.py`): motions and derivatives of random scenes
-against SciPy's DOP853 with equations in plain Python."""
+"""A part of the fuzz test of all scene parts (`benchmarks/fuzz.py`).
+
+Motions and derivatives of random scenes against SciPy's DOP853 with equations in plain Python.
+"""
 
 import jax
 import numpy as np
@@ -14,8 +16,9 @@ SEED = 20261125
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
 @pytest.mark.slow  # 10 s to 60 s each, most of it in compiling and in the reference
 def test_random_motions_of_a_part_keep_rtol(part):
-    """All runs of regular motions within 10 rtol, at four tolerances; none flagged but for friction
-    in a narrow layer, which is stiff."""
+    """All runs of regular motions have errors below 10 rtol, at four tolerances; none is flagged
+    except friction in a narrow layer, which is stiff.
+    """
     rows = list(fuzz.results(fuzz.Group((part,), "float64", False), 3, SEED, 30.0))
     ran = [row for row in rows if "kind" in row]
     assert not [row for row in rows if "raised" in row]
@@ -48,8 +51,9 @@ DIFFERENTIATED = (
 )
 @pytest.mark.slow
 def test_derivatives_of_a_part_keep_rtol(part):
-    """Median error at most 50 rtol and the worst 1,000 rtol, beside differences of the reference,
-    whose own rounding is up to 1e-9."""
+    """Median error at most 50 rtol and maximum 1,000 rtol, against differences of the reference,
+    whose own rounding error is up to 1e-9.
+    """
     rows = [row for row in fuzz.derivatives(part, "float64", 1, SEED, 30.0) if row["status"] == 0]
     if not rows:
         pytest.skip("no reference: a small change of the case adds or removes a switch")

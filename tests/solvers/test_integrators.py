@@ -60,7 +60,7 @@ def worst(solution, truth):
 
 @cache
 def stepper(solver):
-    """Final state after a number of steps that is not known when compiling."""
+    """Final state after a number of steps that is traced."""
 
     @jax.jit
     def run(steps):
@@ -103,7 +103,7 @@ EXTRAPOLATION_STEPS = {
 @pytest.mark.parametrize("order", EXTRAPOLATION_STEPS)
 def test_extrapolation_has_its_order(order):
     found, errors = measured_order(Extrapolation(order), *EXTRAPOLATION_STEPS[order])
-    assert errors[1] > 1e-14  # above rounding: the slope means something
+    assert errors[1] > 1e-14  # above rounding, so that the order is meaningful
     assert abs(found - order) < 0.1 * order
 
 
@@ -122,7 +122,7 @@ def test_dense_output_has_the_accuracy_of_the_step():
 
 
 def marched(order, rtol):
-    """To each time in one step of diffrax, divided by the solver itself."""
+    """To each time in one step of diffrax, which the solver divides."""
     solver = Extrapolation(order, accuracy=Accuracy(rtol, END))
     controller = diffrax.StepTo(jnp.asarray((0.0, *TIMES, END)))
     saveat = diffrax.SaveAt(steps=True, solver_state=True)
@@ -130,7 +130,7 @@ def marched(order, rtol):
 
 
 def test_marching_keeps_the_accuracy_asked_for():
-    """At every time, of every body, by an estimate; more is asked for with more work."""
+    """At every time, of every body, by an estimate; smaller tolerances need more work."""
     run, work = jax.jit(marched, static_argnums=0), []
     for rtol in (1e-4, 1e-7, 1e-10, 1e-12):
         found = run(None, jnp.asarray(rtol))
@@ -207,7 +207,7 @@ def test_kernel_with_unused_operands_and_other_operations():
     x = jnp.arange(5.0)
     calls = []
     jax.jit(kernel(lambda a: calls.append(0) or jnp.sort(-a)))(jnp.ones(3))
-    assert len(calls) == 1  # one that a unit cannot hold is not traced again
+    assert len(calls) == 1  # a function that cannot be fused is not traced again
     add = kernel(lambda a, unused, b: a + b)
     np.testing.assert_array_equal(jax.jit(add)(x, x * 2, x), 2 * x)
     np.testing.assert_array_equal(jax.jit(kernel(lambda a: jnp.sort(-a)))(x), -x[::-1])
@@ -216,7 +216,7 @@ def test_kernel_with_unused_operands_and_other_operations():
 
 
 def test_a_compiled_unit_takes_constants():
-    """XLA would move them inside, and abort the process over the operand then left unused."""
+    """XLA would move them into the kernel, and abort the process because of the unused operand."""
     table = np.random.default_rng(0).normal(size=(1000, 4))
 
     def motion(x, table):

@@ -1,4 +1,4 @@
-"""Bodies in a queue: each ends as it does alone, whatever the others do, and none is waited for."""
+"""A work queue of bodies: each ends as it does alone, and no body waits for another."""
 
 from functools import partial
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class _Weights(NamedTuple):
 
 
 def _counted(wanted, weight, dtype):
-    """Bodies that take ``wanted`` steps and add up their weight; steps of the loop."""
+    """Bodies that take ``wanted`` steps and sum their weight; number of iterations."""
     n = wanted.shape[0]
     fixed = _Weights(jnp.arange(n, dtype=jnp.int32), weight.astype(dtype), jnp.asarray(1, dtype))
 
@@ -65,7 +65,7 @@ def test_every_body_takes_its_own_steps_and_few_lanes_stand_empty(n, dtype):
 
 
 def test_a_batch_of_queues_ends_when_the_longest_is_through():
-    """Queues that are through stay so while others of the batch go on."""
+    """Finished queues do not change while others of the batch continue."""
     wanted = np.stack([np.full(80, 2), np.arange(80) + 1, np.full(80, 50)])
     wanted[0, 7] = 0
     run = jax.vmap(lambda x: _counted(x, jnp.arange(80), jnp.float64))
@@ -78,7 +78,7 @@ def _scene(moments, *acts):
 
 
 def _drawn(n):
-    """Tops whose steps differ by a factor of ten."""
+    """Tops whose numbers of steps differ by a factor of ten."""
     rng = np.random.default_rng(5)
     moments = np.sort(rng.uniform(1, 2, (n, 3)), axis=-1)
     wxyz = rng.normal(size=(n, 4))
@@ -97,7 +97,7 @@ def _ends(chunk, moments, wxyz, omega, acts=(GRAVITY,)):
 
 
 def _moved(chunk, acts):
-    """Slopes of a number made of the last states, and all that was moved, in one program."""
+    """Derivatives of a function of the last states, and all final states, in one program."""
 
     def total(*given):
         found = _ends(chunk, *given, acts)
@@ -109,8 +109,9 @@ def _moved(chunk, acts):
 
 @pytest.mark.slow
 def test_a_queue_does_not_change_values():
-    """Beside chunks of 30, none of which has more bodies than there are lanes; and a body that is
-    no number keeps none from its lane."""
+    """Compared with chunks of 30, none of which has more bodies than lanes; a NaN body does not
+    block its lane.
+    """
     given = _drawn(N)
     given[2][17] = 1e3
     queued, apart = (jax.jit(partial(_ends, chunk))(*given) for chunk in (None, 30))
@@ -150,7 +151,7 @@ def test_batches_of_queues_are_queues():
 
 
 def _together(*acts):
-    """Bodies that one solve is given."""
+    """Bodies that share one solve."""
     moments, wxyz, omega = _drawn(N)
     scene, chart = _scene(moments, *acts), LiePoissonChart()
     state, ts = ph.State(jnp.asarray(wxyz), jnp.asarray(omega)), jnp.array([0.0, 1.0])

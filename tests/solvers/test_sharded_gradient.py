@@ -1,4 +1,4 @@
-"""The gradient of a batch that is sharded over devices is that of the batch on one."""
+"""The gradient of a batch that is sharded over devices equals that of the batch on one."""
 
 from pathlib import Path
 

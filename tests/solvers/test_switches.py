@@ -1,4 +1,4 @@
-"""Kinks and jumps of a field: found in its program, ended at, and passed by derivatives."""
+"""Kinks and jumps of a field: detected in its program, ends of steps, and passed by derivatives."""
 
 import functools
 
@@ -65,7 +65,7 @@ def program(fn, *examples):
     ],
 )
 def test_every_switch_of_a_program_is_found(fn, count, jumps):
-    """With the levels of a point held, the program has the same values near it, and no kink."""
+    """With constant levels of a point, the program has the same values near it, and no kink."""
     x = jnp.array([0.3, -0.7, 1.4])
     found = program(fn, x)
     if count is not None:
@@ -82,7 +82,9 @@ def test_every_switch_of_a_program_is_found(fn, count, jumps):
 
 
 def test_samples_of_an_attitude_are_no_switches():
-    """The pieces between them meet with two derivatives. Two: of the sine of a small angle."""
+    """The pieces of the interpolant join with two continuous derivatives. The two switches are
+    those of the sine of a small angle.
+    """
     lead = ph.simulate(ph.Scene(INERTIA), ph.State(WXYZ, OMEGA), TS)
     attitude = ph.frames.RotatingFrame.from_trajectory(lead).attitude
     assert program(attitude, jnp.zeros(())).count == 2
@@ -100,7 +102,7 @@ def test_what_cannot_be_looked_into_is_named():
 
 
 def test_an_unknown_operation_that_makes_integers_is_named():
-    """Newer versions of JAX have new ones: their jumps must not pass unseen."""
+    """Newer versions of JAX may add operations, whose jumps must not be missed."""
     counted = Primitive("counted")
     counted.def_impl(lambda x: jnp.sum(x > 0))
     counted.def_abstract_eval(lambda x: jax.core.ShapedArray((), jnp.int32))
@@ -117,7 +119,7 @@ def test_an_unknown_operation_that_makes_integers_is_named():
 
 
 class HiddenJump(eqx.Module):
-    """A torque about z that is twice as strong above a rate of 1 rad/s, by way of a loop."""
+    """A torque about z that doubles above a rate of 1 rad/s, computed inside a loop."""
 
     torque: jax.Array
 
@@ -130,8 +132,9 @@ class HiddenJump(eqx.Module):
 
 @pytest.mark.parametrize("torque", [1e-2, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_jumps_that_a_loop_hides_are_found(torque):
-    """A ball is slowed down at 2 ``torque`` until its rate passes 1 rad/s, then at ``torque``: weak
-    beside the rates, so that the jump is easy to overlook."""
+    """A ball is decelerated by 2 ``torque`` until its rate passes 1 rad/s, then by ``torque``:
+    small compared with the rates, so that the jump is difficult to detect.
+    """
     span, rtol = 20.0, 1e-8
     passing = np.random.default_rng(6).uniform(1, 19, 48)
     omega = jnp.zeros((48, 3)).at[:, 2].set(1 + 2 * torque * passing)
@@ -175,7 +178,7 @@ def looked_up(p, rate):
 
 
 def largest(p, rate):
-    """The same in two ranges, by the place of the largest of three numbers."""
+    """The same in two ranges, from the index of the largest of three numbers."""
     return jnp.array([0.1, 0.2, 0.3])[jnp.argmax(jnp.stack([p, rate, 0.1 * p]))]
 
 
@@ -195,7 +198,7 @@ def largest(p, rate):
     ids=["digitize", "argmax"],
 )
 def test_derivatives_through_a_table(law, p, span, slope, mode):
-    """A search in a table turns several comparisons at once. In reverse mode: a jump below."""
+    """A search in a table changes several comparisons at once. In reverse mode: a jump below."""
 
     def final_rate(p):
         scene = ph.Scene(
@@ -233,7 +236,7 @@ def test_a_torque_that_calls_python_is_explained():
 
 @pytest.mark.parametrize(("rate", "jumps"), [(0.0, True), (1e-4, True), (0.0, False)])
 def test_no_window_is_passed_by_a_body_that_hardly_turns(rate, jumps):
-    """Torque in windows of the time: between them, and in them, steps could be of any length."""
+    """Torque within windows of time: between them, and within them, steps could have any length."""
     period, torque, size = 300.0, 1e-9, 2.0
 
     def law(t, wxyz, omega):
@@ -255,7 +258,7 @@ def test_no_window_is_passed_by_a_body_that_hardly_turns(rate, jumps):
 
 @pytest.mark.parametrize("limit", [100.0, 0.2])
 def test_checks_and_prints_in_a_torque_do_as_they_say(limit, capfd):
-    """A check raises where its condition holds, and a print shows what it is given."""
+    """A check raises if its condition is violated, and a print shows its argument."""
 
     def braking(t, wxyz, omega):
         jax.debug.print("t={}", t)
@@ -297,7 +300,7 @@ def moved(p, omega, law, rtol):
 def truth(p, omega, law):
     """SciPy's motion, in pieces that end where a level of the law's program changes.
 
-    The pieces are found by bisection on the law's own conditions, without polhode.
+    The pieces are located by bisection on the law's own conditions, without polhode.
     """
     torque = jax.jit(LAWS[law](p))
 
@@ -330,8 +333,9 @@ def test_states_through_switches(law):
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["dead band", "short way", "pulse"])
 def test_gradients_through_switches(law):
-    """Both modes, against differences of the values; the error falls with rtol. A kink of the
-    rates, jumps with the attitude and with the time."""
+    """Both modes, against differences of the values; the error decreases with rtol. A kink of the
+    rates, and jumps that depend on the attitude and on time.
+    """
     p = jnp.array([0.4, 0.3])
     given = jnp.concatenate([p, OMEGA])
 
@@ -376,8 +380,9 @@ def falling(p, omega, max_steps=128):
     ],
 )
 def test_a_gradient_through_a_jump(max_steps):
-    """The time of a jump moves with the state and with the threshold, a parameter. Of the steps
-    that are allowed the 256th part is recorded: if more are taken, they are integrated again."""
+    """The time of a jump depends on the state and on the threshold, a parameter. Only 1/256 of the
+    allowed steps is recorded: if more steps are taken, they are integrated again.
+    """
     slope = jax.jit(jax.value_and_grad(lambda *x: falling(*x, max_steps), (0, 1)))
     value, (by_p, by_omega) = slope(*FALLING)
     np.testing.assert_allclose(value, LEVEL - 0.1 * (5 - MET), rtol=1e-9)
@@ -385,8 +390,9 @@ def test_a_gradient_through_a_jump(max_steps):
 
 
 def test_the_gradient_through_a_kink_keeps_a_tight_tolerance():
-    """Located to more than some ``rtol`` of a step, a kink leaves an error of this size.
-    w' = -k (w - p) - c above p, then w' = -c."""
+    """A kink located less accurately than ``rtol`` of a step causes an error of this size.
+    w' = -k (w - p) - c above p, then w' = -c.
+    """
     k, c, rtol = 2.0, 0.1, 1e-10
 
     def last(p, w):
@@ -404,7 +410,7 @@ def test_the_gradient_through_a_kink_keeps_a_tight_tolerance():
     np.testing.assert_allclose(found, [1 - share, share], rtol=0, atol=20 * rtol)
 
 
-@pytest.mark.slow  # a single body: test_a_gradient_through_a_jump
+@pytest.mark.slow  # faster: a single body, test_a_gradient_through_a_jump
 @pytest.mark.parametrize("how", ["batch", "grad of vmap", "vmap of grad"])
 def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how):
     starts = jnp.array(np.outer([1.0, 0.7, 1.3], OMEGA))
@@ -440,7 +446,8 @@ def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how
 @pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_switches_that_turn_together_have_times_of_their_own(mode):
     """A relay on each axis, all three at the same rate: w' = -0.2 above a half, -0.05 below, so
-    that a quarter of a change of the rate is left."""
+    that a quarter of a change of the rate remains.
+    """
 
     def final_rates(rates):
         law = lambda t, q, w: jnp.where(w > 0.5, -0.2, -0.05)  # noqa: E731
@@ -473,7 +480,7 @@ def test_a_pulse_may_begin_where_another_ends(bodies, ts):
         np.testing.assert_allclose(mode(final_rates)(edges).T, expected, atol=1e-7)
 
 
-@pytest.mark.slow  # forward mode through jumps: test_derivatives_through_a_table
+@pytest.mark.slow  # faster: forward mode through jumps, test_derivatives_through_a_table
 def test_a_tangent_through_a_jump():
     along = jnp.array([0.3, -0.2]), jnp.array([0.0, 0.0, 0.5])
     _, change = jax.jvp(falling, FALLING, along)
@@ -481,7 +488,7 @@ def test_a_tangent_through_a_jump():
 
 
 class Relay(eqx.Module):
-    """A torque about x against the rate, and a push beside it, both in units of 0.3 N m."""
+    """A torque about x opposite to the rate, and a constant torque, both in units of 0.3 N m."""
 
     push: jax.Array
 
@@ -492,7 +499,7 @@ class Relay(eqx.Module):
 @pytest.mark.parametrize("push", [0.0, 0.7])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_relay_that_slides_says_so(dtype, push):
-    """Single precision runs out of digits before 16 reversals."""
+    """Single precision has no digits left before 16 reversals."""
 
     relay = ph.FeedbackTorque(Relay(jnp.asarray(push, dtype)))
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS.astype(dtype)), None, relay)
@@ -506,7 +513,7 @@ def test_a_relay_that_slides_says_so(dtype, push):
 
 @pytest.mark.slow
 def test_second_derivatives_through_a_jump():
-    """By rate and level: of ``level - 0.1 (5 - log(level) / rate)``."""
+    """With respect to rate and level, of ``level - 0.1 (5 - log(level) / rate)``."""
 
     def end(p):
         def law(t, wxyz, omega):
@@ -524,7 +531,7 @@ def test_second_derivatives_through_a_jump():
 
 
 def test_a_side_beyond_which_the_field_is_no_number():
-    """Steps hold the side of a root until the motion is there, and do not pass it."""
+    """Steps use the side of a square root before the switch until its time, and do not pass it."""
 
     def law(t, wxyz, omega):
         size = 1 + jnp.where(omega[2] > 0, jnp.sqrt(omega[2]), 0.0)
@@ -557,10 +564,10 @@ ROOTS = {
 derivative by x, the start and a parameter."""
 
 
-@pytest.mark.slow  # a root of the state: test_a_side_beyond_which_the_field_is_no_number
+@pytest.mark.slow  # faster: a root of the state, test_a_side_beyond_which_the_field_is_no_number
 @pytest.mark.parametrize("kind", ROOTS)
 def test_roots_of_a_size_that_passes_zero(kind):
-    """The side after the switch is no number before it either, and its slope is infinite there."""
+    """Neither branch can be continued past the switch, where the derivative is infinite."""
     rate, last, slope = ROOTS[kind]
 
     def end(x):
@@ -576,7 +583,7 @@ def test_roots_of_a_size_that_passes_zero(kind):
 
 
 def test_tangents_of_a_failed_body_are_no_zeros():
-    """A zero would look like a minimum. In reverse mode the others count alone."""
+    """A zero would look like a minimum. In reverse mode only the others contribute."""
 
     def last(gain, omega):
         brake = ph.FeedbackTorque(lambda t, q, w: -gain * w * jnp.sqrt(4 - w @ w))
@@ -592,7 +599,7 @@ def test_tangents_of_a_failed_body_are_no_zeros():
 
 @pytest.mark.slow
 def test_gradients_of_a_batch_through_switches():
-    """Wider than a fused kernel, and in segments of four steps, as of one body."""
+    """Wider than a fused kernel, and in segments of four steps, as for one body."""
 
     def law(t, wxyz, omega):
         return jnp.clip(-0.5 * omega, -0.1, 0.2) + 0.05 * jnp.sin(3 * t)
@@ -610,8 +617,9 @@ def test_gradients_of_a_batch_through_switches():
 
 @pytest.mark.slow
 def test_a_torque_that_points_along_an_orbit():
-    """The frame's quaternion changes its sign, and with it the shorter way of ``ph.Pointing``; the
-    checks of a rotation matrix compare rounding errors. The body ends at rest in the frame."""
+    """The frame's quaternion changes sign, and with it the shorter way of ``ph.Pointing``; the
+    checks of a rotation matrix compare rounding errors. The body ends at rest in the frame.
+    """
     orbit = ph.KeplerOrbit(3.986004418e14, 6.871e6, inclination=np.deg2rad(97.4))
     frame = ph.LVLH(orbit)
     torque = ph.RelativeTorque(ph.Pointing(2e-4, 5e-3), frame)
@@ -625,7 +633,7 @@ def test_a_torque_that_points_along_an_orbit():
 
 @pytest.mark.parametrize("start", [-690.2, 1e4])
 def test_switches_at_times_far_from_zero(start):
-    """Where a margin of the time is exactly zero between two representable times."""
+    """Where a margin in time is exactly zero between two representable times."""
     torque = ph.Pulses(ph.BodyTorque([0.0, 0, 1]), [start + 0.3], [start + 100])
     limited = ph.FeedbackTorque(lambda t, wxyz, omega: -1e-9 * jnp.maximum(omega, 0))
     scene = ph.Scene(ph.Inertia.spherical(1.0), None, torque + limited)
@@ -634,8 +642,9 @@ def test_switches_at_times_far_from_zero(start):
 
 
 def test_single_precision_turns_no_switch_late_and_rounds_no_weight():
-    """170 rad and 11 jumps. Of switches that all turn late, or of weights that are off by the same
-    amount in every step, the attitude had errors of 4e-4 and more."""
+    """170 rad and 11 jumps. If all switches were late, or weights off by the same amount in every
+    step, the attitude would have errors of 4e-4 and more.
+    """
 
     def last(dtype, rtol):
         kp, kd = ([1.8e-2, 1.3e-2, 0.9e-2], [2e-4, 2e-4, 2e-4])
@@ -650,7 +659,7 @@ def test_single_precision_turns_no_switch_late_and_rounds_no_weight():
 
 
 def test_switches_that_change_the_sides_of_others():
-    """The first one flips the arguments of two more, which together leave the torque constant."""
+    """The first one exchanges the arguments of two more; together they do not change the torque."""
 
     def law(t, wxyz, omega):
         flipped = jnp.where(omega[2] > 0.5, 1.0, -1.0) * (1 + omega[2] ** 2)
@@ -664,9 +673,11 @@ def test_switches_that_change_the_sides_of_others():
 
 @pytest.mark.slow
 def test_a_side_that_changes_with_another_switch_shortly_before_its_root():
-    """The frame's quaternion changes its sign at 3.064 s, and with it the side of the shorter way
-    to the target; between that and the next root of the side at 3.100 s it was taken for one that
-    has just turned at a root, with an error of 20 rtol and more without a warning."""
+    """The frame's quaternion changes sign at 3.064 s, and with it the side of the shorter way to
+    the target. Between this time and the next root of that side, at 3.100 s, the side must not be
+    treated as one that has just switched at a root, which caused errors of 20 rtol and more without
+    a warning.
+    """
     wxyz = [-0.30543534, 0.13632259, -0.85229906, 0.40213395]
     target = [0.012701, 0.22738476, -0.77803086, -0.58549367]
     orbit = ph.KeplerOrbit(
@@ -685,7 +696,7 @@ WEIGHTS = jax.random.normal(jax.random.key(0), (48, 3)), jax.random.normal(jax.r
 
 
 def by_network(scale, rtol, method=None):
-    """The last state under a network of 48 relu, the weights of which have a common factor."""
+    """The last state under a network of 48 relu, whose weights have a common factor."""
 
     def law(t, wxyz, omega):
         hidden = jax.nn.relu(WEIGHTS[0] @ (3 * omega) + WEIGHTS[1])
@@ -699,7 +710,7 @@ def by_network(scale, rtol, method=None):
 
 @pytest.mark.slow
 def test_many_switches_are_passed_by_steps_of_lower_order():
-    """From 1e-7 on, where order 8 would take more evaluations for the same number of steps."""
+    """From an rtol of 1e-7 on, where order 8 needs more evaluations for as many steps."""
     want, gradient = (f(lambda s: by_network(s, 1e-11)[0])(1.0) for f in (lambda f: f, jax.grad))
     for rtol, order in ((1e-5, 5), (1e-8, 8)):
         value, plan = by_network(1.0, rtol)
@@ -712,7 +723,7 @@ def test_many_switches_are_passed_by_steps_of_lower_order():
 
 @pytest.mark.slow
 def test_coarse_steps_pass_switches():
-    """The state keeps rtol, the gradient an error of about its square root."""
+    """The state has an error below rtol, the gradient one of about its square root."""
     coarse = ph.CoarseSteps()
 
     def loss(scale):
@@ -724,7 +735,7 @@ def test_coarse_steps_pass_switches():
 
 
 def test_coarse_steps_say_what_they_are():
-    """What is not theirs is refused."""
+    """Options that do not apply are rejected."""
     coarse, state, ts = ph.CoarseSteps(), ph.State(WXYZ, OMEGA), [0.0, 1.0]
 
     def scene(limit):
@@ -746,7 +757,7 @@ def test_coarse_steps_say_what_they_are():
 
 
 def test_the_rule_of_lower_order():
-    """The coefficients of diffrax, and dense output that is exact for what the rule solves."""
+    """The coefficients are those of diffrax, and dense output is exact for a quartic."""
     tableau = diffrax.Tsit5.tableau
     for i, row in enumerate(tableau.a_lower):
         np.testing.assert_array_equal(TSIT5.weights[i + 1, : len(row)], row)
@@ -760,7 +771,7 @@ def test_the_rule_of_lower_order():
 
 
 def test_a_heading_that_passes_half_a_turn_has_its_derivative():
-    """The angle jumps by a turn there, and so does the torque: in reverse mode, too."""
+    """The angle jumps by a full turn there, and so does the torque; also in reverse mode."""
 
     def heading(t, wxyz, omega_body):
         angle = jnp.arctan2(2 * wxyz[0] * wxyz[3], wxyz[0] ** 2 - wxyz[3] ** 2)

@@ -31,7 +31,7 @@ def field(t, y):
 
 @pytest.mark.parametrize("rule", [DOP853, TSIT5], ids=["DOP853", "Tsit5"])
 def test_the_error_of_dense_output_is_that_many_times_the_one_at_the_end(rule):
-    """In the geometric mean over bodies and widths, and the mean over places in the step."""
+    """Geometric mean over bodies and step sizes, of the mean over positions in the step."""
     rng = np.random.default_rng(1)
     logs = []
     for width in (0.3, 0.6, 1.0):
@@ -65,7 +65,7 @@ def test_the_error_of_dense_output_is_that_many_times_the_one_at_the_end(rule):
 
 
 def narrow_fields(rng, bodies):
-    """Rates of one number, with something narrow in or beside a step from 0 to 1."""
+    """Scalar rates with a narrow feature within or near a step from 0 to 1."""
     width = 10 ** rng.uniform(-1.3, 0.5, bodies)
     place, drive = rng.uniform(-0.2, 1.2, bodies), rng.uniform(1.2, 4, bodies)
     return (
@@ -84,7 +84,7 @@ def one_step(field, t, y, width):
 
 
 def test_steps_that_pass_something_narrow_are_noticed():
-    """Error over estimate, with the sixth divided difference and without it."""
+    """Error over estimate, with and without the sixth divided difference."""
     rng = np.random.default_rng(0)
     found = {True: [], False: []}
     for field in narrow_fields(rng, 5000):
@@ -111,11 +111,13 @@ def test_steps_that_pass_something_narrow_are_noticed():
 
 @cache
 def order_conditions(order):
-    """For every rooted tree of so many nodes the weights of its order condition: as factors of one
-    stage, products of those of the trees below (Hairer, Norsett & Wanner, section II.2)."""
+    """For every rooted tree with this number of nodes, the weights of its order condition: factors
+    of one stage, which are products of those of its subtrees (Hairer, Norsett & Wanner, section
+    II.2).
+    """
 
     def forests(nodes, largest):
-        """Products of the trees of as many nodes in all, each of at most ``largest``."""
+        """Products of trees with this total number of nodes, each of at most ``largest``."""
         if nodes == 0:
             return [np.ones(DOP853.stages)]
         table = DOP853.weights[: DOP853.stages, : DOP853.stages]
@@ -130,9 +132,10 @@ def order_conditions(order):
 
 
 def test_the_difference_is_the_only_combination_of_the_seventh_order():
-    """All order conditions up to the sixth hold, and no other combination of stages solves them.
+    """It satisfies all order conditions up to the sixth, and no other combination of stages does.
 
-    Trees that differ in the order of their branches are repeated, which changes neither."""
+    Trees that differ in the order of their branches occur repeatedly, which does not matter.
+    """
     conditions = np.array([row for order in range(1, 7) for row in order_conditions(order)])
     size = np.linalg.norm(DOP853.difference)
     np.testing.assert_allclose(conditions @ DOP853.difference / size, 0, atol=1e-13)

@@ -1,12 +1,12 @@
-"""Writes stress_truth.json: states and derivatives of the stress suite's bodies from 50 digits.
+"""Writes stress_truth.json: states and derivatives of the stress suite's bodies with 50 digits.
 
 Run by hand from the repository's root (``python tests/stress/make_stress_truth.py``, some minutes)
-after a change of benchmarks/stress_families.py; bodies already in the file are kept.
+after a change of benchmarks/stress_families.py; bodies that the file already contains are retained.
 
-The Taylor series of tests/free/reference_free.py carry the motion; at long horizons over one
-period of the momentum in the body and over what is left of the last one, the turn about the
-momentum in a whole period being raised to the number of periods. Derivatives are central
-differences along two directions.
+The Taylor series of tests/free/reference_free.py compute the motion; over long horizons they
+compute one period of the momentum in the body and the remainder, and the rotation about the
+momentum in one period is raised to the number of periods. Derivatives are central differences along
+two directions.
 """
 
 import json
@@ -24,7 +24,7 @@ from reference_free import _step, _tensor
 from benchmarks.stress_families import Body, bodies, nutation
 
 DIGITS = 50
-# Neighbours part by up to nine decades: the step's square stays below the last digit of a double.
+# Deviations grow by up to nine decades: the squared step is still below double precision.
 STEP = mp.mpf(10) ** -21
 
 
@@ -69,7 +69,7 @@ def start_of(kind: str, x):
 
 
 def carry(inverse, q, momentum, t):
-    """Attitude, momentum after t, and the angle turned through."""
+    """Attitude and momentum after t, and the rotation angle."""
     left, angle = mp.mpf(t), mp.mpf(0)
     while left != 0:
         rate = mp.norm(inverse * mp.matrix(momentum))

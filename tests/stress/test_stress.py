@@ -15,7 +15,7 @@ PAIRS = stress.load()
 FAMILIES = list(dict.fromkeys(body.family for body, _ in PAIRS))
 # In units of eps x max(1, angle turned): about twice the worst that benchmarks/stress.py prints.
 BOUND = {"attitude": 7.0, "rates": 11.0, "forward": 25.0, "reverse": 15.0}
-# The tensors are turned to principal axes first; one of them has moments 1 : 100. Twenty e-folds
+# Tensors are rotated to principal axes first; one of them has moments 1 : 100. Twenty e-folds
 # at the unstable axis make derivatives of conditioning 100.
 ROOM = {"tensors": 3.0, "dwelling": 3.0}
 
@@ -30,13 +30,13 @@ ROOM = {"tensors": 3.0, "dwelling": 3.0}
     ],
 )
 def scores(request):
-    """Modes and scores. One program each: values with one mode of derivatives at most."""
+    """Modes and scores, in one program each: values with at most one mode of derivatives."""
     dtype, modes = request.param
     return modes, stress.measure(dtype, PAIRS, "forward" in modes, "reverse" in modes)
 
 
 def _spread(name: str) -> float:
-    """Middle over smallest moment of a family named by its moments."""
+    """Intermediate over smallest moment of a family that is named by its moments."""
     low, middle, _ = sorted(float(x) for x in name[1 : name.index(")")].split(","))
     return middle / low
 
@@ -50,7 +50,7 @@ def test_family(scores, family):
         for name in ("attitude", "rates", *modes):
             bound = ROOM.get(family, 1) * BOUND[name]
             if family == "ratios" and name in ("forward", "reverse"):
-                # A fast needle: derivatives lose the ratio of its moments.
+                # A fast needle: errors of derivatives grow with the ratio of its moments.
                 bound += 0.2 * _spread(score["name"])
             assert score[name] <= bound, (score["name"], name)  # NaN fails too
 
@@ -58,7 +58,7 @@ def test_family(scores, family):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.slow
 def test_spin_about_the_unstable_axis_for_ever(dtype):
-    """Values stay exact; derivatives grow without bound and must not become NaN."""
+    """Values remain exact; derivatives grow without bound and must not become NaN."""
     x = jnp.asarray((2.0, 3.0, 5.0), dtype)
 
     def run(moments, omega):
@@ -81,9 +81,9 @@ def test_spin_about_the_unstable_axis_for_ever(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.slow  # long horizons of the family: above
+@pytest.mark.slow  # faster: long horizons of the family, above
 def test_compensated_horizons(dtype):
-    """Up to a million turns the error is that of the last operations, not of the phase."""
+    """Up to a million revolutions the error is that of the last operations, not of the phase."""
     pairs = [pair for pair in PAIRS if pair[0].family in ("horizons", "separatrix", "ulps")]
     pairs = [pair for pair in pairs if dtype == np.float64 or pair[0].fits_single]
     x = jnp.asarray(np.array([body.inputs for body, _ in pairs]), dtype)
@@ -97,7 +97,7 @@ def test_compensated_horizons(dtype):
         off = 2 * min(np.linalg.norm(found - q), np.linalg.norm(found + q))
         rates = np.asarray(done.omega_body)[n, 0]
         off = max(off, np.linalg.norm(rates.astype(np.longdouble) - w) / np.linalg.norm(w))
-        # A product of two halves keeps a half more than the dtype.
+        # A product of two halves is more accurate than the dtype.
         phase = 2.0**-11 if dtype == np.float32 else 2.0**-27
         room = 1 if body.family != "horizons" else phase
         assert off <= np.finfo(dtype).eps * (6 + 2 * room * row["angle"]), body.name

@@ -1,6 +1,6 @@
-"""Writes truth.json: ``python tests/systems/make_truth.py [name ...]``, all or the ones named.
+"""Writes truth.json: ``python tests/systems/make_truth.py [name ...]``, for all systems by default.
 
-All take a few minutes.
+All systems take a few minutes.
 """
 
 import itertools

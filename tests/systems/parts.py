@@ -1,6 +1,6 @@
-"""Reference motions of plates, tables, wheels, gyroscopes and held commands, written out by hand.
+"""Reference motions of plates, tables, wheels, gyroscopes and sampled commands, written by hand.
 
-Only for ``make_truth.py``: nothing of the package is used here.
+Only for ``make_truth.py``; the package is not used.
 """
 
 import taylor
@@ -25,7 +25,9 @@ def field_of(system):
 
 
 def more_unknowns(system, y):
-    """Beside rates and quaternion: momenta of wheels, cosine and sine of the gimbal's angle."""
+    """Unknowns besides rates and quaternion: momenta of wheels, cosine and sine of the gimbal
+    angle.
+    """
     if "wheels" in system.acts:
         axes, inertia, speeds, *_ = system.acts["wheels"]
         return [mpf(inertia) * (mpf(s) + dot(a, y)) for a, s in zip(_units(axes), speeds)]
@@ -52,7 +54,7 @@ def _in_body(rows, vector):
 
 
 def _exposed(normal, direction):
-    """Cosine (times the size) of a plate's exposure, which must stay above zero."""
+    """Cosine (times the size) of a plate's exposure, which must remain positive."""
     along = dot([lift(x) for x in normal], direction)
     assert along[0] > mpf("0.1"), "a plate turns away"
     return along
@@ -124,7 +126,7 @@ def _with_wheels(moments, axes, inertia, speeds, gains, dumping):
 
 
 def _with_gyro(moments, momentum, rate):
-    """A gimbal about body z that turns at a constant rate, the wheel's axis along x at first."""
+    """A gimbal about body z that rotates at a constant rate, the wheel's axis initially along x."""
     momentum, rate = mpf(momentum), mpf(rate)
 
     def field(t, y):

@@ -1,9 +1,10 @@
 # ruff: noqa: E501 (one system, one line)
-"""The systems that every way of moving a body is tested on; README.md derives them.
+"""The systems on which every method is tested; README.md derives them.
 
-One entry is one file of numbers: inertia, initial state, times, what acts. ``truth.json`` holds
-the exact final state and its exact gradient with respect to the principal moments, made by
-``python tests/systems/make_truth.py`` with 50 digits, independently of the package.
+One entry is one set of numbers: inertia, initial state, times, potentials, torques and wheels.
+``truth.json`` contains the exact final state and its exact gradient with respect to the principal
+moments, computed by ``python tests/systems/make_truth.py`` with 50 digits, independently of the
+package.
 """
 
 import json
@@ -20,7 +21,7 @@ TRUTH = Path(__file__).with_name("truth.json")
 
 @dataclass(frozen=True)
 class System:
-    """A body in exactly representable numbers, and what acts on it."""
+    """A body in exactly representable numbers, with its potentials, torques and wheels."""
 
     name: str
     moments: tuple[float, float, float]
@@ -38,11 +39,11 @@ class System:
 
     @property
     def is_simple(self) -> bool:
-        """Whether ``torque`` has all that acts; the rest is in ``parts.py``."""
+        """Whether ``torque`` describes everything; otherwise the rest is in ``parts.py``."""
         return SIMPLE.issuperset(self.acts)
 
     def torque(self, moments):
-        """Torque in body axes for the reference integrator, written out from Newton's law."""
+        """Torque in body axes for the reference integrator, from Newton's law."""
         acts = self.acts
         if not acts:
             return None
@@ -80,7 +81,7 @@ class System:
 
     @property
     def sink(self) -> float:
-        """k of the slip k (L x omega) of a body that loses energy inside."""
+        """k of the slip k (L x omega) of a body with internal dissipation."""
         return self.acts.get("sink", 0.0)
 
 
@@ -181,7 +182,7 @@ SYSTEMS = [
         (0, 5),
         {"fading": 0.125},
     ),
-    # what was added to the simple torques, one system each
+    # one system for each part that is not a simple torque
     System("torque_from_a_table", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4), {"table": CURVE}, 28),
     System(
         "air_drag",

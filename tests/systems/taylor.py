@@ -1,7 +1,7 @@
-"""Taylor series to high order in 50-digit arithmetic: the independent truth of the systems table.
+"""Taylor series to high order in 50-digit arithmetic: the independent reference of the systems.
 
-A motion is an expression in its unknowns; every product keeps its Taylor coefficients, so that a
-step of order 40 costs some 40^2 multiplications a product. Nothing of the package is used here.
+A motion is an expression in its unknowns; every product stores its Taylor coefficients, so that a
+step of order 40 needs about 40^2 multiplications per product. The package is not used.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ ORDER = 44
 
 
 class Node:
-    """A power series in time whose coefficients are found one after the other."""
+    """A power series in time whose coefficients are computed one after another."""
 
     def __init__(self, rule: Callable[[int], mpf]):
         self._rule, self._known = rule, []
@@ -51,7 +51,7 @@ def lift(value) -> Node:
 
 
 def reciprocal(a: Node) -> Node:
-    """1/a: the convolution of both is one."""
+    """1/a, whose convolution with a is one."""
 
     def rule(k):
         if k == 0:
@@ -118,7 +118,7 @@ def quaternion_rate(q, rates):
 
 
 def growing_body(moments, growth):
-    """A body with moments that grow as moments + t growth: L is constant in space."""
+    """A body whose moments are moments + t growth: L is constant in space."""
 
     def field(t, y):
         omega, q = y[:3], y[3:]
@@ -133,8 +133,8 @@ def growing_body(moments, growth):
 def body_with_wheels(moments, axes, inertia, motor, torque):
     """y = (omega, q, c): c are the momenta J (Omega + a . omega) of wheels about unit axes a.
 
-    ``moments``: of the body with its wheels locked. ``motor(omega)``: torque on each wheel;
-    ``torque(rows, h)``: on the body from outside, h the momentum of the wheels.
+    ``moments``: of the body with locked wheels. ``motor(omega)``: torque on each wheel;
+    ``torque(rows, h)``: external torque, h the momentum of the wheels.
     """
     J = mpf(inertia)
     carrier = mp.matrix(3, 3)
@@ -161,7 +161,7 @@ def body_with_wheels(moments, axes, inertia, motor, torque):
 def body(moments, torque=None, sink=0):
     """Rates and quaternion of a body: y = (omega, q); ``torque(t, omega, rows)`` in body axes.
 
-    ``sink``: k of the slip k (L x omega) by which the axes turn beside omega.
+    ``sink``: k of the slip k (L x omega), a rotation of the axes in addition to omega.
     """
     moments = [mpf(m) for m in moments]
 

@@ -1,6 +1,7 @@
-"""Every public way to move a body, on every system that it can take: value and gradient.
+"""Every public method on every system to which it applies: value and gradient.
 
-Bodies of like structure are one batch, so each row of ``METHODS`` is one compiled program a dtype.
+Bodies whose scenes have the same structure are one batch, so each row of ``METHODS`` is one
+compiled program per dtype.
 """
 
 from collections.abc import Sequence
@@ -31,9 +32,10 @@ FEW = [name for name in ALL if {"gravity", "body", "damping"}.issuperset(BY_NAME
 
 @dataclass(frozen=True)
 class Way:
-    """A method, the systems it moves together, and its bars in float64: value, then gradient.
+    """A method, the systems that it simulates together, and its error bounds in float64: value,
+    gradient.
 
-    ``axial``: the bodies are known to be axisymmetric, with two moments each.
+    ``axial``: the bodies are declared axisymmetric, with two moments each.
     """
 
     method: ph.AbstractMethod | None
@@ -65,14 +67,14 @@ METHODS = {
     "Dopri8 of sunlight_and_shadow": Way(ph.LiePoisson(Dopri8()), ["sunlight_and_shadow"]),
 }
 
-# Space axes of the systems seen from the axes that they are moved in: no path of the table meets a
-# pole of the Euler angles there, and nothing but the names of the space axes has changed.
+# Rotation of the space axes in which the systems are simulated, so that no motion passes a pole of
+# the Euler angles; the motions are otherwise the same.
 TILT = np.array([0.51, 0.48, -0.71, 0.0])
 TILT = TILT / np.linalg.norm(TILT)
 
 
 def acting(names: Sequence[str], moments):
-    """Potential and torque of the systems in the package's words; what acts on none is absent."""
+    """Potential and torque of the systems as objects of the package; absent if there are none."""
     dtype, systems = moments.dtype, [BY_NAME[name] for name in names]
 
     def vectors(part):
@@ -109,7 +111,7 @@ def acting(names: Sequence[str], moments):
 
 
 def with_parts(system, moments):
-    """Inertia, torque and rotors of a system that has more than simple torques; a batch of one."""
+    """Inertia, torque and rotors of a system with more than simple torques; a batch of one."""
     ((kind, numbers),) = system.acts.items()
     dtype, ends = moments.dtype, jnp.array(system.span, moments.dtype)
     inertia = ph.Inertia.from_moments(moments)
@@ -164,7 +166,7 @@ def with_parts(system, moments):
 
 
 def final_states(way: Way, moments, rtol):
-    """(omega, wxyz) (N, 7) at the last times, wxyz with the sign of the truth."""
+    """(omega, wxyz) (N, 7) at the last times, wxyz with the sign of the reference."""
     dtype, systems = moments.dtype, [BY_NAME[name] for name in way.names]
     if way.axial:
         inertia = ph.Inertia.axisymmetric(*moments.T)
@@ -190,7 +192,7 @@ def final_states(way: Way, moments, rtol):
 
 
 def check(way: Way, dtype):
-    """Values and gradients at the last times, of all systems of a way in one program."""
+    """Values and gradients at the last times, of all systems of a method in one program."""
     exact = [truth(system) for system in way.names]
     moments = np.array([BY_NAME[system].moments for system in way.names])
     states = np.array([entry["state"] for entry in exact])
@@ -222,7 +224,7 @@ def check(way: Way, dtype):
 
 
 def rows(*heavy: str):
-    """Names of all ways; ``heavy``: those whose programs take long to compile, in the slow lane."""
+    """Names of all methods; ``heavy``: those whose programs take long to compile (slow tests)."""
     slow = pytest.mark.slow
     return [pytest.param(name, marks=slow) if name in heavy else name for name in METHODS]
 
@@ -236,8 +238,8 @@ COVERED = (
     *("planner axisymmetric", "planner body and damping"),  # as ClosedForm and CoarseSteps
     "CoarseSteps",  # without a potential; with one: planner gravity
 )
-# Every method and coordinates in single precision, and wheels; the other rows differ from these in
-# the field or the solver alone.
+# In single precision every method and all coordinates, and wheels; other rows differ only in the
+# field or the solver.
 SINGLE = ("ClosedForm",)
 SINGLE_SLOW = (
     *("planner gravity", "planner axisymmetric", "LagrangeTop", "SymmetricTop", "FixedAxis"),
@@ -259,7 +261,7 @@ def test_state_and_gradient_in_single_precision(name):
 
 
 def test_the_table_runs_every_public_method():
-    """Each is named here, so that a new one is missed by no one."""
+    """Each is named here, so that a new method cannot be forgotten."""
     public = {
         getattr(ph, name)
         for name in dir(ph)

@@ -1,4 +1,4 @@
-"""Which throw tells most: information of a planned throw, with derivatives."""
+"""Design of throws: information of a planned throw, with derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +54,7 @@ def test_a_wheel_that_moves_more_tells_more():
     found = [information(SPIN, still + part * (wheel - still)) for part in (1.0, 0.5, 0.0)]
     most, half, least = np.linalg.slogdet(np.array(found))[1]
     assert most > half > least
-    # what is stated is what single throws of such a body scatter by (benchmarks.throws_synthetic)
+    # the scatter of single throws of this body in benchmarks.throws_synthetic
     trace = np.array([1.0, 1, 1, 0, 0, 0]) / 2
     spread = np.sqrt(trace @ np.linalg.inv(found[0]) @ trace)
     assert 0.003 < spread < 0.012

@@ -1,4 +1,4 @@
-"""``benchmarks.throws``: throws in air with a wheel, by a gyroscope that is not quite right."""
+"""``benchmarks.throws``: throws in air with a wheel and an imperfect gyroscope."""
 
 import itertools
 
@@ -35,14 +35,14 @@ DELAY, STEP, ARM = 6e-4, 1e-3, np.array([0.01, -0.004, 0.03])
 
 
 def speed(t):
-    """Of the wheel: 200 rad/s, 1300 from 0.1 s on, and down again from 0.3 s on."""
+    """Speed of the wheel: 200 rad/s, 1300 from 0.1 s on, and down again from 0.3 s on."""
     first = 1 - np.exp(-np.maximum(t - 0.1, 0) / 0.03)
     last = 1 - np.exp(-np.maximum(t - 0.3, 0) / 0.03)
     return -200 - 1100 * first + 1100 * last
 
 
 def throw(rng, tensor, drag=True):
-    """Times, readings of gyroscope, wheel and accelerometer in half a second of flight."""
+    """Times, and readings of gyroscope, wheel and accelerometer, in half a second of flight."""
     times = np.arange(0, 0.48, STEP)
     inverse = np.linalg.inv(tensor)
 
@@ -75,7 +75,7 @@ def throw(rng, tensor, drag=True):
     reading = np.linalg.solve(np.eye(3) + SKEW, omega.T).T + 0.01 * rng.normal(size=omega.shape)
     force = felt + 0.1 * rng.normal(size=omega.shape)
     wheel = speed(times) + 3 * rng.normal(size=len(times))
-    # after it is switched the motor tells nonsense
+    # after switching, readings of the motor are invalid
     bad = ((times > 0.09) & (times < 0.14)) | ((times > 0.29) & (times < 0.31))
     return times, reading, np.where(bad, np.nan, wheel), force
 
@@ -104,17 +104,17 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     np.testing.assert_allclose(found[[1, 2, 0], [2, 0, 1]], SKEW[[1, 2, 0], [2, 0, 1]], atol=2.5e-3)
     # four samples to a residual: half the noise of one
     np.testing.assert_allclose(fit.noise_levels.omega, 0.005, rtol=0.15)
-    # expected from what was read before: as large as expected, and forgotten at once
+    # innovations: of the expected size, and uncorrelated
     rest = np.asarray(fit.residuals["omega"]).reshape(8, -1, 3)
     np.testing.assert_allclose(np.mean(rest[rest != 0] ** 2), 1, atol=0.1)
     assert abs(np.mean(rest[:, 1:] * rest[:, :-1])) < 0.05
-    # a throw alone, with what all of them say of the instrument
+    # a single throw, with the jointly fitted instrument
     alone = fit_each(fit, given[4:], body=1)
     assert alone.moments.shape == (4, 3)
     assert alone.is_usable
     off = (np.asarray(alone.moments) - true[1]) / np.asarray(alone.moments_std)
     assert np.abs(off).max() < 4
-    # an ideal instrument, taken for granted, misleads by more than the noise does
+    # assuming an ideal instrument causes errors larger than those of the noise
     ideal = jax.tree.map(jnp.zeros_like, fit.instrument)
     ideal = eqx.tree_at(
         lambda device: (device.spin_inertia, device.axis),
@@ -156,7 +156,9 @@ def test_throws_without_a_wheel_show_ratios():
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 30.0])
 def test_single_throws_are_unbiased_and_their_errors_are_the_bound(size):
-    """Of light and of heavy bodies, which the wheel hardly moves: 120 throws, each alone."""
+    """Of light bodies, and of heavy ones that the wheel hardly moves: 120 throws, each fitted
+    alone.
+    """
     number = 120
     found = study.study(size, number, together=30)
     chance = 2.5 / number**0.5
@@ -164,14 +166,14 @@ def test_single_throws_are_unbiased_and_their_errors_are_the_bound(size):
     assert np.abs(found["mean_error_over_std"]).max() < 0.3 + chance
     assert np.abs(np.array(found["rms_error_over_bound"]) - 1.025).max() < 0.075 + chance / 2**0.5
     assert 93 - 5 < found["covered_percent_all"] < 97 + 2.5
-    # what the throws show is not what they do not show: a heavy body is a hundred times dimmer
+    # the information about a heavy body is a hundred times smaller
     low, high = (0.05, 0.6) if size == 1 else (1.0, 3.0)
     assert low < np.max(found["std_percent"]) < high
 
 
 def test_the_accelerometer_tells_its_distance_from_the_centre_of_mass(throws):
     given = stack([Recording.of(t, w, force_body=a) for t, w, _, a in throws])
-    # the errors of the gyroscope are of some 0.5 %
+    # the gyroscope has errors of about 0.5 %
     np.testing.assert_allclose(lever_arm(averaged(given, 4)), np.tile(ARM, (8, 1)), atol=1e-3)
 
 

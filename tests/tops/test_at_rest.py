@@ -50,7 +50,7 @@ CASES = {
     "tumbling about its centre": (TILTED, numbers_of([0.5, -0.3, 2.0], distance=0.0)),
     "slowly without mass": (TILTED, numbers_of([5e-3, -3e-3, 2e-3], mass=0.0, gravity=SLANTED)),
 }
-WHEELS = {  # the second takes up the momentum of the body, which has none in all
+WHEELS = {  # the second wheel cancels the momentum of the body
     "with a wheel": (ph.Rotor.axial(momentum=0.7), REST),
     "balanced by a wheel": (ph.Rotor.axial(momentum=-3.0), [0.0, 0.0, 1.0]),
 }
@@ -58,7 +58,7 @@ WHEELS = {  # the second takes up the momentum of the body, which has none in al
 
 @jax.jit
 def values_and_derivatives(numbers, wxyz, wheel):
-    """Of the closed form with its derivatives in reverse mode too, and of steps."""
+    """Of the closed form, with its derivatives also in reverse mode, and of the integration."""
 
     def exact(x):
         return last(x, wxyz, ph.LagrangeTop(), wheel)
@@ -95,7 +95,7 @@ def test_wheels_against_integration(name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "bound"), [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])
 def test_bodies_at_rest_among_others(dtype, bound):
-    """A batch over the distance, in which one body rests and one turns without weight."""
+    """A batch over the distance, with one body at rest and one that rotates without weight."""
     axes = jax.random.normal(jax.random.key(1), (4, 4), dtype)
     rates = jnp.array([[0, 0, 0], [0, 0, 0], [0.1, 0.2, 0.3], [0.5, -0.3, 2.0]], dtype)
     inertia = ph.Inertia.axisymmetric(*jnp.array([2.0, 3.0], dtype))
@@ -109,7 +109,7 @@ def test_bodies_at_rest_among_others(dtype, bound):
 
     @jax.jit
     def moved_and_slopes(distance, mass):
-        """By the distance, of the last body by the mass."""
+        """With respect to the distance, and to the mass for the last body."""
         along = jnp.array([1.0, 1.0, 1.0, 0.0], dtype)
         return jax.jvp(lambda d, m: moved(d, rates, m), (distance, mass), (along, 1 - along))
 
@@ -119,7 +119,7 @@ def test_bodies_at_rest_among_others(dtype, bound):
     start = ph.State(axes, rates).wxyz[0]
     np.testing.assert_allclose(wxyz[0], start, rtol=0, atol=bound)
     np.testing.assert_array_equal(omega[0], 0)
-    # a body at rest: its rates grow by the torque, its attitude by half of that times the time
+    # a body at rest: rates grow as torque times time, the attitude by half of that times time
     down = ph.rotation.rotate(ph.rotation.conjugate(start), gravity)
     pull = jnp.cross(jnp.array([0, 0, 1], dtype), down) / jnp.array([2, 2, 3], dtype)
     np.testing.assert_allclose(by_distance[1][0], 3 * pull, rtol=0, atol=30 * bound)
@@ -164,7 +164,7 @@ def test_the_first_order_in_the_weight_is_left_to_derivatives_by_the_force(monke
 
 @pytest.mark.slow
 def test_second_derivatives_without_weight_are_no_wrong_numbers():
-    """By the weight of a body that turns they are NaN, of one at rest right."""
+    """With respect to the weight: NaN for a rotating body, right for one at rest."""
 
     def height(mass, rates):
         numbers = numbers_of(jnp.zeros(3), gravity=SLANTED).at[0].set(mass).at[7:].set(rates)
@@ -179,7 +179,7 @@ def test_second_derivatives_without_weight_are_no_wrong_numbers():
 
 
 def test_a_weight_has_second_derivatives_beside_the_first_order_in_it():
-    """Bodies with a weight use no part of it, so that it may not make their Hessian NaN."""
+    """Bodies with weight do not use the first-order term, which must not make their Hessian NaN."""
     one, turning = jnp.ones(1), jnp.array([[0.5, -0.3, 2.0]])
     motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
     arguments = one, turning[:, 2], motion[0][0], turning, 2 * one, one[:, None]

@@ -78,7 +78,7 @@ def test_exact_against_integration(name):
 
 
 def test_what_the_solutions_are_valid_for():
-    """By type where the planner asks; a body whose numbers do not fit has NaN, never a number."""
+    """Chosen by type; a body whose numbers violate the condition is NaN, never a wrong number."""
     wheel = Rotor.axial(momentum=0.3)
     assert SymmetricTop().why_not(ph.Scene(SYMMETRIC, rotors=wheel)) is None
     for word, parts in (
@@ -134,7 +134,7 @@ RESTING = {
 
 @pytest.mark.parametrize("method", [SymmetricTop(), FixedAxis()])
 def test_derivatives_at_rest(method):
-    """Damped with the rate k: the rates by exp(-k t), the attitude by half of its integral."""
+    """Damped at the rate k: the rates by exp(-k t), the attitude by half of its integral."""
     scene = ph.Scene(SYMMETRIC, torque=ph.LinearDamping(0.1 * SYMMETRIC.moments))
     start = jnp.array([0.5, 0.5, 0.1, -0.7])
 
@@ -157,7 +157,7 @@ def test_derivatives_at_rest_of_every_closed_form(name):
 
 
 def check_at_rest(method, scene):
-    """By the rates and a number of the scene, against integration."""
+    """With respect to the rates and a number of the scene, against integration."""
 
     def last(both, method):
         state = ph.State([0.5, 0.5, 0.1, -0.5], both[:3])
@@ -173,7 +173,7 @@ def check_at_rest(method, scene):
 
 
 def test_derivatives_across_a_fixed_axis_are_those_of_this_motion():
-    """Of a body that turns they are zero; of one at rest the second ones are NaN."""
+    """Zero for a rotating body; for one at rest the second derivatives are NaN."""
 
     def last(rates):
         scene = ph.Scene(ph.Inertia.from_moments([2.0, 3.0, 4.0]), torque=ph.LinearDamping(0.1))
@@ -208,7 +208,9 @@ def test_strong_damping_has_a_derivative_in_single_precision():
 
 
 def test_derivatives_that_turn_the_momentum_are_nan_in_the_attitude_alone():
-    """By axial torque, by a wheel's momentum beside damping, and by damping beside a wheel."""
+    """With respect to axial torque, to a wheel's momentum with damping, and to damping with a
+    wheel.
+    """
 
     def end(torque, momentum, damping):
         acting = ph.LinearDamping(damping * SYMMETRIC.moments)

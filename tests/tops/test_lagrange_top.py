@@ -21,7 +21,7 @@ NUMBERS = np.array(list(top_cases.CASES.values())).T  # (10, cases): cases are l
 
 
 def moved(numbers, t):
-    """State (7, N) after t (N,) of lanes of ten numbers."""
+    """State (7, N) after t (N,), from ten numbers for each of N lanes."""
     a, c, pull, *rest = numbers
     omega = jnp.stack(rest[:3], axis=-1)
     q = jnp.stack(rest[3:], axis=-1)
@@ -55,13 +55,13 @@ def test_every_regime_is_exact(exact, dtype, bound):
     got = np.array(VALUE(tuple(x), jnp.full(len(NAMES), top_cases.TIME, dtype)), float).T
     for name, state, entry in zip(NAMES, got, exact):
         error = np.abs(state - entry["state"]).max() / max(1, np.abs(entry["state"]).max())
-        # an unstable equilibrium or separatrix multiplies the rounding of the numbers given
+        # an unstable equilibrium or separatrix amplifies the rounding of the input
         growth = max(1.0, np.abs(entry["gradient"]).max() / 10)
         assert error < bound * growth, (name, error)
 
 
 def bound_of(name):
-    """Relative error of a gradient: of three equal roots the value is exact, the gradient not."""
+    """Bound on the relative error of a gradient: with three equal roots only the value is exact."""
     return 1e-2 if name == "marginal_sleeping" else 1e-11
 
 
@@ -77,7 +77,7 @@ def test_every_gradient_is_exact(exact):
         assert error < bound_of(name), (name, error)
 
 
-@pytest.mark.slow  # derivatives at rest: test_at_rest
+@pytest.mark.slow  # faster: derivatives at rest, test_at_rest
 def test_every_forward_derivative_is_exact(exact):
     x, direction = jnp.asarray(NUMBERS), np.random.default_rng(4).normal(size=10)
     forward = np.array(SLOPE(x, jnp.asarray(direction[:, None] * np.ones_like(NUMBERS)), TIMES))
@@ -88,7 +88,7 @@ def test_every_forward_derivative_is_exact(exact):
 
 
 def test_within_a_hair_of_the_marginal_sleeping_top(exact):
-    """Three roots of the cubic nearly coincide: states stay near that of the sleeping top."""
+    """Three roots of the cubic nearly coincide: states remain near that of the sleeping top."""
     case = np.array(top_cases.CASES["marginal_sleeping"])
     want = exact[NAMES.index("marginal_sleeping")]
     near = np.repeat(case[:, None], len(NAMES), axis=1)
@@ -112,7 +112,7 @@ def test_a_top_that_leaves_the_upright_and_comes_back():
     q = np.array(q) / np.linalg.norm(q, axis=0)
     u1, u2 = 2 * (q[1] * q[3] - q[0] * q[2]), 2 * (q[2] * q[3] + q[0] * q[1])
     below = 2 * (q[1] ** 2 + q[2] ** 2)
-    energy = a * (w1 * w1 + w2 * w2) / 2 - pull * below  # above that of the sleeping top
+    energy = a * (w1 * w1 + w2 * w2) / 2 - pull * below  # relative to the sleeping top
     vertical = a * (u1 * w1 + u2 * w2) - c * w3 * below  # likewise
     assert below.max() > 0.5
     assert np.abs(energy).max() < 1e-7
@@ -175,7 +175,7 @@ def test_gni_lagrange_top():
 
 
 def test_what_the_solution_is_valid_for():
-    """By type where the planner asks; a body whose numbers do not fit has NaN, never a number."""
+    """Chosen by type; a body whose numbers violate the condition is NaN, never a wrong number."""
     state = ph.State([1.0, 0, 0, 0], [0.0, 0.1, 1.0])
     axial = UniformGravity.axial(1.0, 0.5)
     top = ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5), axial)

@@ -1,7 +1,8 @@
-"""Motions of Lagrange's top in every regime: moments A, C, pull M, rates, quaternion, time.
+"""Motions of Lagrange's top in every regime: moments A, C, torque constant M, rates, quaternion,
+time.
 
-V = M u . e3 with u = space z. ``tops_truth.json`` holds the state after TIME and its gradient with
-respect to all ten numbers, made by ``make_tops_truth.py`` with 50 digits and nothing of the
+V = M u . e3 with u = space z. ``tops_truth.json`` contains the state after TIME and its gradient
+with respect to all ten numbers, computed by ``make_tops_truth.py`` with 50 digits, without the
 package.
 """
 
@@ -17,7 +18,7 @@ _UP, _DOWN, _LYING = (0.6, 0.0, 0.0, 0.8), (0.0, 0.6, 0.8, 0.0), (0.8, 0.6, 0.0,
 
 
 def _steady():
-    """Steady precession at 60 degrees: A W^2 cos - b W + M = 0 for the slow rate W."""
+    """Regular precession at 60 degrees: A W^2 cos - b W + M = 0 for the slow rate W."""
     theta, b = math.pi / 3, 3.0
     rate = b - math.sqrt(b * b - 2)
     return (

@@ -22,6 +22,6 @@ def scene_of(first, second, third=None):
 
 
 def last_rates(scene, t=1.0, times=2):
-    """Body rates at the time ``t``; another number of ``times`` traces the program again."""
+    """Body rates at time ``t``; another number of ``times`` traces the program again."""
     ts = jnp.linspace(0.0, t, times)
     return ph.simulate(scene, _STATE, ts, record=_LAST, rtol=1e-8).omega_body

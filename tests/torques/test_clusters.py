@@ -1,4 +1,4 @@
-"""Clusters of wheels, momentum dumping and gyroscopes against NumPy and SciPy by hand."""
+"""Wheel clusters, momentum dumping and gyroscopes against NumPy and SciPy."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +33,7 @@ def matrix(q):
 
 
 def torques_of(rotors, speeds, wxyz, omega):
-    """Motor torques (n,) of the settled wheels at these speeds."""
+    """Motor torques (n,) of the wheels at these speeds."""
     wheels = rotors.settle(jnp.asarray(omega), jnp.zeros(()), jnp.asarray(speeds))
     wheels = wheels.at([wheels.momentum[i] for i in wheels.coupled])
     seen = from_quaternion([jnp.asarray(x) for x in wxyz])
@@ -110,7 +110,7 @@ def test_dumping_is_normal_to_the_field_and_limited():
     np.testing.assert_allclose(found, np.cross(moment, FIELD), rtol=1e-12)
 
 
-# at t = 0 of this orbit x of the local frame is along space y, z along -x, hence y along -z
+# at t = 0 the axes x, y, z of the orbit frame are along space y, -z, -x
 FRAME = ph.LVLH(ph.KeplerOrbit(1.0, 1.0))
 IN_FRAME = np.array([[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]) @ FIELD
 
@@ -148,7 +148,7 @@ def test_dumping_in_pulses_is_that_between_two_parts_without_it():
 
 @pytest.mark.slow
 def test_a_controlled_satellite_is_that_of_scipy():
-    """Cluster with null motion and limits, dumping and a gyroscope, integrated by hand."""
+    """Cluster with null motion and limits, dumping and a gyroscope, integrated by SciPy."""
     wheels = ph.wheel_cluster(
         CORNERS,
         J,

@@ -57,7 +57,7 @@ def test_arrays_of_two_precisions_are_refused():
 
 
 def test_bodies_of_python_numbers_follow_the_state():
-    """Constructors compute with NumPy where that keeps the dtype, and not elsewhere."""
+    """Constructors compute with NumPy only where this preserves the dtype."""
     state = ph.State(single(1.0, 0.0, 0.0, 0.0), single(0.1, 0.2, 1.0))
     for body in (ph.Inertia.from_cylinder(2.0, 0.1, 0.3), ph.Inertia.from_sphere(2.0, 0.1)):
         assert ph.explain(ph.Scene(body), state, [0.0, 1.0]).dtype == "float32"

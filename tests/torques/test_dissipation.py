@@ -1,4 +1,4 @@
-"""Bodies that lose energy inside: an energy sink, wheels and rings that damp nutation."""
+"""Internal dissipation: an energy sink, and wheels and rings that damp nutation."""
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ INSIDE = {
 
 @pytest.mark.parametrize("name", list(INSIDE))
 def test_the_flip_to_a_spin_about_the_largest_moment(name):
-    """R L rests; the energy only falls, by the work said, down to L^2 / (2 I_max)."""
+    """R L is constant; the energy only decreases, by the stated work, to L^2 / (2 I_max)."""
     ts = jnp.linspace(0.0, 1500.0, 61)
     got = ph.simulate(INSIDE[name], STATE, ts, rtol=1e-12, record=WORK)
     momentum, energy = np.array(got.momentum_space), np.array(got.energy)
@@ -42,7 +42,7 @@ def test_the_flip_to_a_spin_about_the_largest_moment(name):
 def test_the_time_of_an_energy_sink():
     """tan theta = tan theta_0 exp(k L^2 (1/C - 1/A) t) about the axis of a symmetric body.
 
-    In value and slope by k, and in the other chart.
+    Value and derivative with respect to k, also in the other coordinates.
     """
     a, c, ts = 2.0, 0.5, np.array([0.0, 1.0, 3.0])
     inertia = ph.Inertia.axisymmetric(a, c)
@@ -67,7 +67,7 @@ def test_the_time_of_an_energy_sink():
 
 
 def test_a_wheel_with_friction_about_one_axis():
-    """The relative speed dies with exp(-c (1/J + 1/(C - J)) t), and its energy with it."""
+    """The relative speed decays as exp(-c (1/J + 1/(C - J)) t), and the energy with it."""
     c, j, friction, speed = 2.5, 0.5, 0.3, 4.0
     ts = np.linspace(0.0, 3.0, 4)
 
@@ -79,7 +79,7 @@ def test_a_wheel_with_friction_about_one_axis():
     got = ph.simulate(scene(friction), state, ts, rtol=1e-12, record=WORK)
     rate = 1 / j + 1 / (c - j)
     fade = np.exp(-friction * rate * ts)
-    taken = j * speed / c * (1 - fade)  # what the body's rate gains
+    taken = j * speed / c * (1 - fade)  # increase of the body's rate
     np.testing.assert_allclose(got.omega_body[:, 2], 1 + taken, rtol=1e-11)
     np.testing.assert_allclose(got.wheel_speed[:, 0], speed * fade, rtol=1e-11)
     lost = -0.5 * speed**2 / rate * (1 - fade**2)
@@ -105,7 +105,7 @@ def test_an_energy_sink_keeps_the_momentum_in_euler_angles():
     ],
 )
 def test_a_ring_against_newton_in_every_chart(name):
-    """A batch with an oblique ring, written out and integrated by SciPy; in single precision."""
+    """A batch with an oblique ring, against SciPy, in all coordinates; in single precision."""
     axis, j, ts = np.array([0.0, 0.6, 0.8]), 0.2, [0.0, 6.0]
     carrier = np.diag(MOMENTS) - j * np.outer(axis, axis)
 
@@ -138,9 +138,11 @@ def test_a_ring_against_newton_in_every_chart(name):
         np.testing.assert_allclose(got.spins[k, -1, 0], end[7], rtol=0, atol=atol)
 
 
-@pytest.mark.slow  # of the field: test_every_torque.py
+@pytest.mark.slow  # faster: derivatives of the field, test_every_torque.py
 def test_slopes_of_a_damped_motion():
-    """By every number of the body and of what damps it, against differences of the motion."""
+    """With respect to every number of the body and of the damping, against differences of the
+    motion.
+    """
 
     def last(x):
         ring = ph.Rotor([0.0, 0.6, 0.8], x[0], speed=x[1], coupling=ph.ViscousCoupling(x[2]))

@@ -1,4 +1,4 @@
-"""The energy grows by the work of what acts from outside, whatever is in the scene."""
+"""The energy changes by the work of external torques, for every kind of scene."""
 
 import jax
 import jax.numpy as jnp
@@ -88,11 +88,11 @@ PASSIVE = {
 
 
 def growth(scene):
-    """Slope of the energy along the motion, and the power that is said to come from outside."""
+    """Derivative of the energy along the motion, and the stated external power."""
     scene = scene.settled(STATE, jnp.array(0.25))
     momentum = tuple(scene.momentum(STATE.omega_body, TIME))
     wxyz, dynamics = tuple(STATE.wxyz), scene.dynamics
-    spins = ((jnp.array(0.7),),) if dynamics.coupled else ()  # any, not those of the start
+    spins = ((jnp.array(0.7),),) if dynamics.coupled else ()  # arbitrary, not the initial ones
     y = (momentum, wxyz, *spins)
     rates = lie_poisson_field(TIME, y, dynamics)
 
@@ -119,8 +119,9 @@ def test_the_power_of_a_motor_is_torque_times_speed():
 
 
 def test_the_power_of_each_wheel():
-    """Torque times relative speed: of a damper -c Omega^2, of a motor its impulse's slope times
-    Omega; a wheel that is held has none in this account."""
+    """Torque times relative speed: -c Omega^2 for a damper, the derivative of the impulse times
+    Omega for a motor; a wheel with prescribed speed has none.
+    """
     scene = ph.Scene(INERTIA, **PARTS["ring damper"]).settled(STATE, jnp.array(0.25))
     momentum = tuple(scene.momentum(STATE.omega_body, TIME))
     seen = momentum, from_quaternion(tuple(STATE.wxyz))

@@ -1,7 +1,7 @@
-"""Everything that can act on a body, at once and batched, against Newton-Euler's equations.
+"""All torques, potentials and wheels, together and batched, against Newton-Euler's equations.
 
-The other side is written out in NumPy and integrated by SciPy's DOP853; its slopes by every number
-in the scene are the imaginary parts for that number moved by i times next to nothing.
+The reference is implemented in NumPy and integrated by SciPy's DOP853; its derivatives with respect
+to every number of the scene are complex-step derivatives.
 """
 
 from functools import cache
@@ -79,7 +79,7 @@ def scene_of(p, dtype):
 
 
 def newton(t, y, p, wheels):
-    """d(wxyz, omega)/dt and d(wxyz, momentum)/dt of one body; complex numbers pass through."""
+    """d(wxyz, omega)/dt and d(wxyz, momentum)/dt of one body; accepts complex numbers."""
     w, x, v, z = y[:4] / np.sqrt(np.sum(y[:4] ** 2))
     rate = y[4:]
     rows = np.array(
@@ -203,7 +203,7 @@ TIME, WEIGHTS = 1.75, np.array([[1.0, 2, -1, 3, 1, -2, 0.5], [-1.0, 1, 2, 1, 3, 
 
 
 def fields(p, dtype):
-    """d(wxyz, momentum)/dt of both bodies some time after the start, as simulate would see them."""
+    """d(wxyz, momentum)/dt of both bodies some time after the start, as in simulate."""
     scene, state, ts = scene_of(p, dtype)
     scene = scene.settled(state, ts[0])
     lanes = {name: flatten(getattr(scene, name), (BODIES,)) for name in PARTS}

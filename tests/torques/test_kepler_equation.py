@@ -59,7 +59,7 @@ def anomaly(mean, e):
 
 
 def exact(mean, e):
-    """Position and velocity (each two mpf) in the plane of the orbit, of mu = |a| = 1."""
+    """Position and velocity (each two mpf) in the plane of the orbit, for mu = |a| = 1."""
     mean, e = mpf(mean), mpf(e)
     x, axis = anomaly(mean, e), mp.sqrt(abs(1 - e * e))
     if e < 1:
@@ -97,7 +97,7 @@ def test_positions(e, dtype):
 
 
 def check_time_derivatives(e, means):
-    """First and second, as Newton's law has them."""
+    """First and second derivatives, from Newton's law."""
     eps = float(np.finfo(float).eps)
 
     def velocity(m):
@@ -132,7 +132,7 @@ def test_all_derivatives_in_time(e):
     "e", [0.99, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.1, 1.5))]
 )
 def test_derivatives_by_the_eccentricity(e):
-    """Up to the second, mixed ones too, and the third in the mean anomaly."""
+    """Up to second order including mixed ones, and the third in the mean anomaly."""
     eps = float(np.finfo(float).eps)
     orders = [(0, 1), (1, 1), (0, 2), (3, 0)]
     means = [1e-6, -0.4, 2.0]
@@ -195,7 +195,7 @@ def from_state(r, v, t, mu):
 
 @pytest.mark.parametrize("e", [1e-12, 1e-3, 0.5, 0.99, 1 - 1e-6, 1 + 1e-6, 1.5, 100.0])
 def test_orbits_by_a_state(e):
-    """Errors beside those that a unit in the last place of the state and the time makes."""
+    """Errors relative to the effect of one unit in the last place of the state and the time."""
     mu, eps = 1.7, float(np.finfo(float).eps)
     starts = [0.0, 1e-3, -0.5, 2.0]
     times = [1e-9, -1e-3, 0.4, 3.0, -40.0]
@@ -227,7 +227,7 @@ def test_orbits_by_a_state(e):
 
 @pytest.mark.slow
 def test_a_circle_by_construction():
-    """Without an eccentricity: the same place as at eccentricity 0, and the same derivatives."""
+    """Without an eccentricity: the same position as at eccentricity 0, and the same derivatives."""
     t = 7.3
     elements = (1.3, 2.1, 0.7, 0.3, 1.1, 0.2, 0.5)
 

@@ -22,7 +22,9 @@ def spun(ends, ts, record=None):
 
 
 def test_no_pulse_is_missed():
-    """One of 10 microseconds, one that is on at the end, one after it; edges among the samples."""
+    """A pulse of 10 microseconds, one that is on at the end, one after the end; edges among the
+    samples.
+    """
     ts = jnp.array([0.0, 3.0, 8.0, 8.25])
     got = spun(ENDS, ts, WORK)
     gain = np.array([0, 0.05, 0.05001, 0.30001])  # torque 2 on a moment of 2
@@ -31,9 +33,9 @@ def test_no_pulse_is_missed():
     assert int(got.steps) < 40
 
 
-@pytest.mark.slow  # derivatives through a jump: solvers/test_switches
+@pytest.mark.slow  # faster: derivatives through a jump, solvers/test_switches
 def test_slopes_by_the_edges_of_pulses():
-    """Rate and angle at the end by the length of the first pulse, and the way back in time."""
+    """Final rate and angle with respect to the length of the first pulse; also backward in time."""
 
     def end(first, ts):
         got = spun([first, *ENDS[1:]], ts, ph.Record(final_only=True))
@@ -47,8 +49,9 @@ def test_slopes_by_the_edges_of_pulses():
 
 
 def test_a_motor_within_its_limits():
-    """Against SciPy: a command of the state and time, saturated, on the line of a DC motor, with
-    dry friction; the work of motor and bearing."""
+    """Against SciPy: a command of state and time, saturated, on the torque-speed line of a DC
+    motor, with dry friction; the work of motor and bearing.
+    """
     c, j, stall, top = 2.0, 0.02, 0.05, 8.0
     ts = np.linspace(0.0, 12.0, 5)
 
@@ -73,7 +76,7 @@ def test_a_motor_within_its_limits():
     exact = solve_ivp(
         field, ts[[0, -1]], start, "DOP853", ts, rtol=1e-11, atol=1e-13, max_step=0.01
     )
-    assert np.max(np.abs(exact.y[2])) > 0.5 * top  # it meets its limits
+    assert np.max(np.abs(exact.y[2])) > 0.5 * top  # it reaches its limits
     np.testing.assert_allclose(got.omega_body[:, 2], exact.y[1], rtol=0, atol=1e-8)
     np.testing.assert_allclose(got.wheel_speed[:, 0], exact.y[2], rtol=0, atol=1e-6)
     np.testing.assert_allclose(got.motor_work[:, 0], exact.y[3], rtol=0, atol=1e-7)
@@ -81,7 +84,7 @@ def test_a_motor_within_its_limits():
 
 
 def test_pulses_within_other_parts_keep_their_edges():
-    """In a sum, in each other, against an orbit frame."""
+    """In a sum, within each other, relative to an orbit frame."""
     inner = ph.Pulses(ph.EnergySink(0.1) + ph.BodyTorque([0.0, 0, 1]), [1.0], [2.0])
     outer = ph.Pulses(inner + ph.LinearDamping(0.1), [0.5], [4.0])
     frame = ph.LVLH(ph.KeplerOrbit(4e14, 7e6))
@@ -93,7 +96,7 @@ def test_pulses_within_other_parts_keep_their_edges():
         for torque in (whole, whole.during(t)):
             slip = torque.slip(jnp.array(t), momentum, omega)
             np.testing.assert_allclose(slip, on * want, atol=1e-16)
-    # what acts between the edges does not ask the time again
+    # between the edges nothing depends on time
     np.testing.assert_allclose(whole.during(1.5).slip(jnp.array(9.0), momentum, omega), want)
     np.testing.assert_array_equal(whole.during(3.0).slip(jnp.array(1.5), momentum, omega), 0)
 
@@ -104,7 +107,7 @@ def components_of(torque, wxyz, omega, t=0.5):
 
 
 def test_pointing_and_rate_damping():
-    """-2 kp times the vector part of the error by the shorter way; both signs of a quaternion."""
+    """-2 kp times the vector part of the shorter error rotation; both signs of a quaternion."""
     target, off = [0.5, 0.5, -0.5, 0.5], np.array([0.3, -0.2, 0.1])
     angle = np.linalg.norm(off)
     turn = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * off / angle])
@@ -120,7 +123,7 @@ def test_pointing_and_rate_damping():
 
 
 def test_a_dipole_in_a_field_of_place_and_time():
-    """m x B with B of the place on an orbit, written out; B-dot brakes, within its limit."""
+    """m x B with B from the position on an orbit, by NumPy; B-dot damps within its limit."""
     earth, place = np.array([0.0, 0.0, -7.8e22]), np.array([7e6, 1e6, 2e6])
     r = np.linalg.norm(place)
     b = 1e-7 * (3 * place * (place @ earth) / r**5 - earth / r**3)
@@ -165,8 +168,9 @@ def test_what_is_refused(make, error, word):
 
 
 def test_limits_of_a_motor_with_a_constant_command_in_a_batch():
-    """Its torque has a kink where the wheel reaches ``max_speed``: steps end there, alone and in a
-    batch."""
+    """Its torque has a kink where the wheel reaches ``max_speed``: steps end there, for single
+    bodies and in a batch.
+    """
 
     def wheel(speed):
         motor = ph.Motor(0.05, max_torque=0.1, max_speed=5.0)
@@ -202,7 +206,7 @@ def test_without_a_field_there_is_no_torque():
 @pytest.mark.slow
 @pytest.mark.parametrize("final_only", [False, True])
 def test_derivatives_by_times_within_a_pulse_of_a_batch(final_only):
-    """A pulse that is on at an end of the span, for bodies that go from edge to edge."""
+    """A pulse that is on at an end of the span, for bodies integrated from edge to edge."""
     burn = ph.Pulses(ph.BodyTorque([0.0, 0.0, 2.0]), [-1.0, 1.2], [0.5, 5.0])
     states = ph.State(np.tile(REST.wxyz, (6, 1)), np.tile([0.1, 1.0, 0.2], (6, 1)))
     record = ph.Record(final_only=final_only)

@@ -27,7 +27,7 @@ def test_the_orbit_obeys_newton():
 
 
 def test_an_orbit_by_place_and_velocity_is_the_same_one():
-    """Of any eccentricity and inclination, long before and after the epoch; both precisions."""
+    """For any eccentricity and inclination, long before and after the epoch; both precisions."""
     for dtype, bound in ((jnp.float64, 2e-12), (jnp.float32, 2e-3)):
         e, tilt = (jnp.array(x, dtype) for x in ([0.0, 1e-9, 0.3, 0.95], [0.0, 1.0, jnp.pi, 0.4]))
         number = jnp.ones((), dtype)
@@ -52,7 +52,7 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
 
 @pytest.mark.parametrize("radius", [pytest.param(6.9e6, marks=pytest.mark.slow), 4.2164e7])
 def test_derivatives_by_the_size_of_an_orbit_in_single_precision(radius):
-    """Fields fall with the cube of the distance: derivatives -3 and 12 times the field."""
+    """Fields decrease with the cube of the distance: derivatives -3 and 12 times the field."""
     for dtype, bound in ((jnp.float64, 1e-13), (jnp.float32, 1e-5)):
         place = jnp.array([0.6, -0.48, 0.64], dtype) * radius
         dipole = ph.DipoleField(jnp.array([1e22, 2e22, -7.8e22], dtype))
@@ -100,7 +100,7 @@ def test_an_orbit_through_a_state_is_a_kepler_orbit():
 
 @pytest.mark.parametrize("e", [0.0, 1e-8, 0.4, 0.9])
 def test_slopes_of_an_orbit_by_state(e):
-    """Against 50 digits' differences; a circle and an orbit in the plane are no exceptions."""
+    """Against 50-digit differences; including a circle and an orbit in the reference plane."""
     mu, t = 1.7, 11.0
     place, velocity = [1.2, 0.0, 0.0], [0.0, float(np.sqrt(mu * (1 + e) / 1.2)), 0.0]
 
@@ -152,9 +152,9 @@ def test_refused_orbits():
         KeplerOrbit(1.0, -1.0)
 
 
-@pytest.mark.slow  # librations of other bodies: test_published.py
+@pytest.mark.slow  # faster: librations of other bodies, test_published.py
 def test_pitch_libration_on_a_circular_orbit():
-    """theta'' = -3 n^2 (Ix - Iz)/Iy sin theta cos theta in the orbit's turning frame.
+    """theta'' = -3 n^2 (Ix - Iz)/Iy sin theta cos theta in the rotating frame of the orbit.
 
     Small librations, and their derivative with respect to the moments.
     """

@@ -1,4 +1,4 @@
-"""Hyperbolas, the frame that goes along with an orbit, torques in it, and Apophis in 2029."""
+"""Hyperbolic orbits, the orbit frame, torques relative to it, and Apophis in 2029."""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ def two_bodies(position, velocity, times):
 
 @pytest.mark.parametrize("excess", [1.01, 1.5, 8.0])  # speed at periapsis over the circular one
 def test_orbits_of_both_kinds_obey_newtons_law(excess):
-    """A conic through a periapsis, as elements and as a state at another time."""
+    """A conic through a periapsis, from elements and from a state at another time."""
     r0 = 4e7
     v0 = excess * np.sqrt(MU / r0)
     times = np.array([-2e5, -3e3, 0.0, 40.0, 2e4, 3e5])
@@ -71,9 +71,9 @@ ECCENTRIC = ph.KeplerOrbit(MU, 9e6, 0.2, inclination=0.7, node=0.4, periapsis=-0
 
 
 def test_the_frame_is_where_its_definition_puts_it():
-    """Axes from the two-body problem by NumPy, rates from differences of the axes."""
+    """Axes from the two-body problem in NumPy, rates from differences of the axes."""
     times = np.array([0.0, 1234.5, 6000.0])
-    orbits = (ECCENTRIC, lambda t: ECCENTRIC(t))  # of a function the plane may turn
+    orbits = (ECCENTRIC, lambda t: ECCENTRIC(t))  # with a function the orbital plane may rotate
     start = np.concatenate([ECCENTRIC(0.0), ECCENTRIC.velocity_at(0.0)])
     truth = two_bodies(start[:3], start[3:], times)
     z = -truth[:, :3] / np.linalg.norm(truth[:, :3], axis=-1, keepdims=True)
@@ -115,7 +115,7 @@ JEOD_PITCH_RATE = [-0.1, -0.06896551724137931, -0.01, -0.001030927835051546]
 
 
 def test_rates_do_not_depend_on_the_size_of_the_orbit_in_single_precision():
-    """Nor does the yaw rate, of an orbit that leaves its plane."""
+    """Including the yaw rate of an orbit whose plane changes."""
 
     def rates(size):
         def place(t):
@@ -142,8 +142,9 @@ def test_a_table_of_positions_may_be_that_of_a_batch():
 
 
 def test_the_frame_of_nasas_jeod():
-    """Its log of a body on a straight line, and the start of its SIM_dyncomp (state.py, run 9B):
-    yaw, pitch and roll of (0, -11.6, 0) degrees at rest to the frame of a circular orbit."""
+    """Its log for a body on a straight line, and the start of its SIM_dyncomp (state.py, run 9B):
+    yaw, pitch and roll of (0, -11.6, 0) degrees at rest relative to the frame of a circular orbit.
+    """
     times = jnp.array([0.0, 1.0, 10.0, 40.0])
     line = ph.LVLH(lambda t: jnp.stack([10 + 2 * t, t, 0 * t]))
     gap = ph.rotation.angle_between(
@@ -179,7 +180,7 @@ def test_the_frame_of_nasas_jeod():
 
 
 def test_damping_against_the_frame_brings_a_body_to_its_rate():
-    """A ball at rest in space: about y its rate is -n (1 - exp(-c t / I)); roll and yaw stay 0."""
+    """A ball at rest in space: about y its rate is -n (1 - exp(-c t / I)); roll and yaw are 0."""
     frame = ph.LVLH(ph.KeplerOrbit(MU, [7e6, 8e6]))
     n = np.sqrt(MU / np.array([7e6, 8e6]) ** 3)
     start, _ = frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0)
@@ -201,12 +202,12 @@ def test_damping_against_the_frame_brings_a_body_to_its_rate():
 HOUR = 3600.0
 
 
-@pytest.mark.slow  # the frame itself: below
+@pytest.mark.slow  # faster: the frame itself, below
 def test_apophis_is_spun_anew_in_2029():
     """Perigee 38,000 km, 5.84 km/s at infinity; periods of 27.4 h and 263 h before.
 
-    C. J. Benson et al., Icarus 390 (2023) 115324: the effective spin rate could halve or double,
-    the pole is likely to shift by 10 degrees or more, and the short-axis mode to be kept. Moments
+    C. J. Benson et al., Icarus 390 (2023) 115324: the effective spin rate may halve or double, the
+    pole probably shifts by 10 degrees or more, and the short-axis mode probably persists. Moments
     and energy: P. Pravec et al., Icarus 233 (2014) 48.
     """
     inertia = ph.Inertia.from_moments([0.61, 0.965, 1.0])

@@ -41,10 +41,11 @@ def test_momentum_and_energy(name):
 
 
 def test_euler_equation_with_wheels():
-    """I' domega/dt = L x omega - u a, and the energy of the body and of wheels that are not held.
+    """I' domega/dt = L x omega - u a, and the energy of the body and of wheels without prescribed
+    speed.
 
-    I' leaves out wheels that are free about their axes a, to which their motors give u. Conserved
-    quantities do not show the sign of the wheels, nor constant parts of the energy.
+    I' excludes wheels that are free about their axes a, on which their motors exert u. Conserved
+    quantities do not reveal the sign of the wheels, nor constant parts of the energy.
     """
     omega, moments = np.array([0.4, -0.5, 0.1]), np.diag([1.0, 2.0, 2.5])
     oblique, upright = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -115,7 +116,7 @@ BODY = ph.Inertia.from_moments([2.0, 1.4, 1.5])
 
 @pytest.mark.slow
 def test_the_last_state_continues_with_its_wheels():
-    """Two simulations in a row are one; also through the settled scene of a trajectory."""
+    """Two successive simulations equal one; also with the scene stored in a trajectory."""
     scene = ph.Scene(BODY, rotors=FREE + HELD + DRAGGED)
     whole = ph.simulate(scene, STATE, [1.0, 2.0, 3.0], rtol=1e-12)
     first = ph.simulate(scene, STATE, [1.0, 2.0], rtol=1e-12)

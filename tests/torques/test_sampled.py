@@ -1,4 +1,4 @@
-"""Commands that are computed at fixed times and held in between."""
+"""Commands that are computed at fixed times and constant in between."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ TS = [0.0, 0.1, 0.25, 0.75, 1.6]
 
 
 def law(t, wxyz, omega):
-    """With a kink and a jump, which a held command does not pass on to the field."""
+    """A law with a kink and a jump, which a sampled command does not transfer to the field."""
     return jnp.clip(-0.8 * omega - 0.5 * wxyz[1:] * jnp.sign(wxyz[0]), -0.2, 0.2) + 0.1 * t
 
 
@@ -54,7 +54,7 @@ def test_a_held_command_against_scipy():
 
 
 def test_a_held_command_beside_a_wheel_with_friction():
-    """The momentum of the wheel goes on over the edges: against SciPy, segment by segment."""
+    """The momentum of the wheel continues across the edges: against SciPy, by segments."""
     spin_inertia, friction, speed = 0.05, 0.02, 20.0
     carrier = np.diag(MOMENTS) - np.diag([0, 0, spin_inertia])
 
@@ -84,7 +84,7 @@ def test_a_held_command_beside_a_wheel_with_friction():
 
 @pytest.mark.slow
 def test_a_held_command_beside_damping_of_a_batch():
-    """Bodies enough for the midpoint rule, a sum of torques, and times of which one is kept."""
+    """Enough bodies for the midpoint rule, a sum of torques, and only one saved time."""
     torque = ph.LinearDamping(0.3) + ph.SampledTorque(law, PERIOD)
     rates = OMEGA * np.linspace(1, 2, 6)[:, None]
     states = ph.State(np.tile(WXYZ, (6, 1)), rates)
@@ -97,7 +97,9 @@ def test_a_held_command_beside_damping_of_a_batch():
 
 @pytest.mark.slow
 def test_derivatives_of_a_held_command():
-    """By the initial rates and by a gain, in reverse mode under ``jit``, against differences."""
+    """With respect to the initial rates and a gain, reverse mode under ``jit``, against
+    differences.
+    """
 
     def loss(omega, gain):
         fn = jax.tree_util.Partial(lambda g, t, wxyz, w: -g * w - 0.5 * wxyz[1:], gain)
@@ -135,7 +137,7 @@ def test_a_sampled_torque_says_what_it_cannot():
 
 
 def test_samples_at_the_ends_of_periods_are_edges_in_single_precision():
-    """There 100.1 is 1.5e-6 before it: no segment is shorter than the rounding of its ends."""
+    """In float32, 100.1 is 1.5e-6 too small: no segment may be shorter than rounding."""
     fn = ph.SampledTorque(law, 0.1)
     body = ph.Inertia.from_moments(jnp.asarray(MOMENTS, jnp.float32))
     state = ph.State(jnp.asarray(WXYZ, jnp.float32), jnp.asarray(OMEGA, jnp.float32))

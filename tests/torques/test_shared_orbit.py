@@ -1,4 +1,4 @@
-"""One orbit in several parts of a scene: the same motion and derivatives as with several."""
+"""One orbit object in several parts of a scene: same motion and derivatives as several objects."""
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ def test_the_same_motion_and_derivative_as_with_orbits_of_their_own():
 
 @pytest.mark.slow
 def test_the_derivative_by_a_shared_orbit():
-    """Adds what comes through each of the parts."""
+    """It is the sum of the contributions of all parts."""
 
     def shared(e):
         orbit = orbit_of(e)

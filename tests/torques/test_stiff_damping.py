@@ -1,4 +1,4 @@
-"""Damping far faster than the motion: right, or said not to be."""
+"""Damping much faster than the motion: right, or reported by the status."""
 
 from functools import cache
 
@@ -54,7 +54,7 @@ def damped(dtype, linear, quadratic):
     [pytest.param(jnp.float64, 1e-9, marks=pytest.mark.slow), (jnp.float32, 1e-5)],
 )
 def test_strong_damping_is_right_or_marked(dtype, rtol):
-    """Rates of damping times the horizon of 1e4 and more; of 1e8 the steps do not suffice."""
+    """Damping rates times the horizon of 1e4 and more; at 1e8 the limit of steps is reached."""
     record = ph.Record(final_only=True)
     end = ph.simulate(*damped(dtype, LINEAR, QUADRATIC), rtol=rtol, record=record)
     assert np.all(end.steps[:3] > 500)  # but not where drag is strong at first only
@@ -68,7 +68,7 @@ def test_strong_damping_is_right_or_marked(dtype, rtol):
     assert lost.value.status[3] == ph.Status.SUCCESSFUL
 
 
-@pytest.mark.slow  # strong damping: above
+@pytest.mark.slow  # faster: strong damping, above
 def test_an_implicit_solver_takes_any_damping():
     method, linear = ph.LiePoisson(diffrax.Kvaerno5(), chunk=1), 1e4 * LINEAR[1:2]
     scene = damped(jnp.float64, linear, np.zeros(1))

@@ -1,4 +1,4 @@
-"""Tables over time, drag, sunlight and shadow against NumPy and SciPy's integration by hand."""
+"""Tables over time, drag, sunlight and shadow against NumPy and SciPy."""
 
 from itertools import pairwise
 
@@ -90,8 +90,10 @@ def test_values_and_derivatives_have_common_batch_axes(batched):
 
 @pytest.mark.parametrize("order", [1, 3])
 def test_kinks_of_a_table_end_steps(order):
-    """The torque is a polynomial between them, so that steps of high order are exact; a second
-    derivative that jumps within a step costs up to several hundred rtol without a warning."""
+    """Between the knots the torque is a polynomial, for which steps of high order are exact; a jump
+    of the second derivative within a step would cause errors up to several hundred rtol without a
+    warning.
+    """
     values, slopes = np.array([[0.0, 1.0, -2.0, 3.0, 3.0], [1.0, -3.0, 2.0, 0.0, 4.0]])
     times = np.array([0.0, 1.0, 1.7, 3.1, 4.0])
     along = jnp.array([[0.0, 0.0, 1.0]])
@@ -301,8 +303,9 @@ def test_bodies_with_tables_of_their_own():
 
 @pytest.mark.slow  # of one body: solvers/test_switches.py::test_derivatives_through_a_table
 def test_mapped_gradients_go_back_through_the_steps_of_each_body():
-    """More bodies than a unit holds, those with strong torques in more steps than others: of a
-    sphere with damping, w' = (p torque - c w) / I."""
+    """More bodies than a fused kernel contains, with different numbers of steps: a sphere with
+    damping, w' = (p torque - c w) / I.
+    """
     times, moment, drag = np.linspace(0.0, 1.0, 5), 2.0, 0.5
     torques = np.stack([np.sin(3 * times), 1 - times, times**2], axis=-1)
 

@@ -10,7 +10,7 @@ from polhode import FeedbackTorque, QuadraticDamping
 
 @pytest.mark.slow
 def test_quadratic_damping_about_one_axis():
-    """I domega/dt = -c omega^2: omega = w/(1 + c w t/I), with its derivative; at rest nothing."""
+    """I domega/dt = -c omega^2: omega = w/(1 + c w t/I), with its derivative; zero at rest."""
     state = ph.State([1.0, 0, 0, 0], [[0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
     ts = jnp.array([0.0, 3.0])
 
@@ -28,7 +28,7 @@ def test_quadratic_damping_about_one_axis():
 
 
 def test_feedback_is_a_function_of_time_attitude_and_rates():
-    """A torque that restores the attitude and damps brings the body to rest there."""
+    """A restoring and damping torque brings the body to rest at the target."""
 
     def law(t, wxyz, omega):
         assert wxyz.shape == (4,)
@@ -44,7 +44,9 @@ def test_feedback_is_a_function_of_time_attitude_and_rates():
 
 
 def test_kovalevskaya_top():
-    """A = B = 2 C, centre in the equator: |(w1 + i w2)^2 - (mu/C)(u1 + i u2)|^2 is constant."""
+    """A = B = 2 C, centre of mass in the equator: |(w1 + i w2)^2 - (mu/C)(u1 + i u2)|^2 is
+    constant.
+    """
     c, mu = 0.5, 0.7
     inertia = ph.Inertia.from_moments([2 * c, 2 * c, c])
     scene = ph.Scene(inertia, ph.UniformGravity(1.0, (mu, 0.0, 0.0), (0.0, 0.0, -1.0)))
@@ -59,9 +61,9 @@ def test_kovalevskaya_top():
 
 
 @pytest.mark.parametrize("wrap", ["alone", pytest.param("in pulses", marks=pytest.mark.slow)])
-@pytest.mark.slow  # a shorter way: solvers/test_switches
+@pytest.mark.slow  # faster: a shorter way, solvers/test_switches
 def test_pointing_through_half_a_turn_keeps_rtol(wrap):
-    """The law jumps there; Dopri8 at a tight tolerance, step by step, is the truth."""
+    """The law jumps there; the reference is Dopri8 at a tight tolerance."""
     rng = np.random.default_rng(3)
     state = ph.State(rng.normal(size=(8, 4)), rng.normal(size=(8, 3)))
     law = ph.Pointing(0.6, 0.05)

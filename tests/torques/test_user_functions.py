@@ -1,4 +1,4 @@
-"""Functions of users: looked at when a part is made, kept so that trees hold arrays only."""
+"""User functions: checked at construction of a part; pytrees contain arrays only."""
 
 import math
 
@@ -135,7 +135,7 @@ def test_scenes_are_trees_of_arrays():
 
 @pytest.mark.slow  # a closure is differentiated in tests/test_stepping.py, leaves everywhere
 def test_a_scene_goes_through_jit_and_grad_and_closures_are_differentiated():
-    """The derivative by a closed-over number is that by the same number as a leaf."""
+    """The derivative by a closed-over number equals that by the same number as a leaf."""
     method = ph.LiePoisson(max_steps=64)
 
     def end(scene):
@@ -153,7 +153,7 @@ def test_a_scene_goes_through_jit_and_grad_and_closures_are_differentiated():
 
 
 def test_times_may_be_many():
-    """Functions of one time are mapped over the samples, also where there are three of them."""
+    """Functions of one time are mapped over the samples, even if there are three of them."""
     from polhode._hamiltonian import from_quaternion
 
     ts = jnp.array([0.0, 1.0, 2.0])
@@ -202,7 +202,7 @@ def test_what_tracing_forbids_is_named_with_its_jax_form(part, mistake):
 
 
 def test_what_tracing_forbids_is_named_inside_the_simulation():
-    """A branch that the first look does not reach: of the precision of the scene alone."""
+    """A branch that the check at construction does not reach, since it depends on the dtype."""
 
     def push(t):
         return jnp.ones(3) if t.weak_type else np.sin(t) * jnp.ones(3)

@@ -1,4 +1,4 @@
-"""Work of the external torques, the error estimate of each body, librations of a satellite."""
+"""Work of external torques, the error estimate of each body, librations of a satellite."""
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ def test_energy_changes_by_the_work(method):
     np.testing.assert_allclose(plain.wxyz, traj.wxyz, rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow  # work beside the energy: above
+@pytest.mark.slow  # faster: work beside the energy, above
 def test_work_on_a_damped_and_driven_spin():
     """About one axis: -(I w0^2 / 2)(1 - exp(-2 c t / I)), and N times the angle."""
     state, record = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.5]), ph.Record(work=True)
@@ -59,23 +59,23 @@ def test_work_on_a_damped_and_driven_spin():
 
 
 @pytest.mark.parametrize("rtol", [1e-6, 1e-10])
-@pytest.mark.slow  # of three systems: below
+@pytest.mark.slow  # faster: of three systems, below
 def test_the_estimate_bounds_the_error(rtol):
-    """Heavy tops that end far apart, against a run near rounding; whoever misses is marked."""
+    """Heavy tops with very different errors, against a run near rounding; others are flagged."""
     keys = jax.random.split(jax.random.key(5), 2)
     wxyz = rotation.normalise(jax.random.normal(keys[0], (40, 4)))
     state = ph.State(wxyz, 2 * jax.random.normal(keys[1], (40, 3)))
     scene, ts = ph.Scene(INERTIA, GRAVITY), jnp.array([0.0, 60.0])
     record = ph.Record(final_only=True, error=True)
-    # With compensated sums: what rounding adds to plain ones is as large as the estimate.
+    # With compensated sums; rounding of plain sums is as large as the estimate.
     solver = ph.Extrapolation(16, compensated=True)
     pushed = ph.State(wxyz, state.omega_body + 1e-9)
     best, beside = (
         ph.simulate(scene, x, ts, ph.LiePoisson(solver), rtol=5e-14).wxyz[:, -1]
         for x in (state, pushed)
     )
-    # A rate off by 1e-9 rad/s turns a regular top by 60 to 500 times that [rad] in the 60 s, a
-    # chaotic one by 2,500 to 2e6: how its errors grow is not what the estimate is good for.
+    # An error of 1e-9 rad/s grows to 60 to 500 times that [rad] in 60 s for a regular top, and to
+    # 2,500 to 2e6 times for a chaotic one, whose growth the estimate does not predict.
     calm = np.asarray(rotation.angle_between(best, beside)) < 1e-9 * 1000
     assert np.sum(calm) > 30
     traj = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)
@@ -131,12 +131,12 @@ def test_exact_motions_estimate_rounding_and_own_controllers_are_refused():
         ph.simulate(ph.Scene(INERTIA), STATE, TS, own, record=record)
 
 
-@pytest.mark.slow  # of an orbit: tests/test_published
+@pytest.mark.slow  # faster: of an orbit, tests/test_published
 def test_libration_in_a_gravity_gradient():
     """About one axis: I3 a'' = -(s/2)(I2 - I1) sin 2a, s = 3 mu/r^3: a pendulum of the angle 2a.
 
     Its period is 4 K(sin a0) / Omega, Omega^2 = s (I2 - I1)/I3, and a quarter of it after release
-    the rate is -Omega sin a0; what I2 does to the angle there follows from the scaling of time.
+    the rate is -Omega sin a0; the derivative with respect to I2 follows from scaling of time.
     """
     s, a0, moments = 3.0, 0.01, jnp.array([1.0, 1.5, 2.0])
     omega = np.sqrt(s * 0.5 / 2.0)

@@ -1,8 +1,8 @@
-"""Run by the tests in a process of its own: units of which XLA folds this or that away.
+"""Script for tests, in its own process: fused kernels in which XLA simplifies parts to constants.
 
-Prints a line for each: its name, and the largest difference to the plain function. XLA answers a
-wrong use of the mark by ending the process. ``each``: a program for each unit, which names the one
-that ends it; ``few``: three of the ways.
+Prints a line for each: its name, and the largest difference from the plain function. If a kernel is
+wrong, XLA ends the process. ``each``: one program per kernel, to identify the one that ends it;
+``few``: only three of the transformations.
 """
 
 import sys
@@ -145,7 +145,7 @@ def _away(a, b):
 
 
 def _runs(fn, given):
-    """The ways that make sense for a unit."""
+    """The transformations that apply to a kernel."""
     if given[0].size == 0 or given[0].ndim == 0:
         return {"value": WAYS["value"]}
     smooth = given[0].dtype == float and np.all(np.isfinite(given[0]))
@@ -162,7 +162,7 @@ def main(each: bool, few: bool):
 
 
 def _compare(units, way, how):
-    """One program for all of the units, as each would take its second to compile."""
+    """One program for all kernels, since each would take a second to compile."""
     if len(units) == 1:
         print(f"{next(iter(units))}, {way}{how and f', {how}'}: ...", flush=True)
     of, refused = (WAYS | SLOPES)[way], {}
@@ -181,7 +181,7 @@ def _compare(units, way, how):
 
     def both(unknown):
         nonlocal one
-        one = unknown  # lest XLA works all of it out while it compiles
+        one = unknown  # traced, so that XLA cannot evaluate everything during compilation
         return all_of(marked=True), all_of(marked=False)
 
     found, plain = jax.jit(both)(one)

@@ -1,13 +1,13 @@
-"""Scenes with generated functions of the user's, of which XLA may fold this or that away.
+"""Scenes with generated user functions, parts of which XLA may simplify to constants.
 
 ``python tests/xla/fuzz.py COUNT [SEED]`` draws COUNT functions and runs each in five ways (value,
-gradient, jit, vmap, and under jit with a solver of diffrax) in child processes; it prints how many
-ended badly, and which. A child writes down what it is about to do, so that an end is laid to one
-function; the next child goes on behind it. What Python refuses with a ValueError or TypeError
-counts as answered.
+gradient, jit, vmap, and under jit with a solver of diffrax) in child processes; it prints which of
+them ended abnormally. A child writes down each case before it starts it, so that an abnormal end is
+attributed to one function; the next child continues after it. A ValueError or TypeError is an
+accepted result.
 
-``python tests/xla/fuzz.py units COUNT [SEED]`` marks the functions alone, 25 to a program, without
-a scene around them: a hundred times as many for the same work, and folded even more.
+``python tests/xla/fuzz.py units COUNT [SEED]`` runs only the functions as fused kernels, 25 in one
+program, without a scene: a hundred times as many in the same time, with even more simplification.
 """
 
 import os
@@ -31,9 +31,9 @@ OF_SCENES = (*WAYS, "stock")
 
 
 def number(rng, x, depth):
-    """A function of time ``t`` and a list of numbers ``x``, drawn at random, with one result.
+    """A random function of time ``t`` and a list of numbers ``x``, with one result.
 
-    Returned with what it is made of, in words.
+    Returned with its description.
     """
     made = list(_MADE.items())
     name, make = made[rng.integers(len(made))]
@@ -184,7 +184,7 @@ KINDS = ("body torque", "space torque", "feedback", "potential", "rotor", "orbit
 
 
 def scene(kind, functions, scale):
-    """A scene whose ``kind`` of part is made of three functions, all times ``scale``."""
+    """A scene whose part of this ``kind`` uses three functions, all multiplied by ``scale``."""
     inertia = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 
     def vector(t, x):
@@ -254,7 +254,7 @@ def run(kind, functions, way):
 
 
 def child(seed, start, stop, log):
-    """Works through cases and writes each down before it begins."""
+    """Run cases, and write down each before it starts."""
     for case in range(start, stop):
         kind, functions, _ = draw(seed, case // len(OF_SCENES))
         way = OF_SCENES[case % len(OF_SCENES)]
@@ -279,7 +279,7 @@ DERIVATIVES = ({}, {"linearised": True}, {"repeated": True})
 
 
 def unit(f, ways, how):
-    """Values and slopes of one marked function of the time, two arrays and an integer."""
+    """Values and derivatives of one fused function of time, two arrays and an integer."""
 
     def whole(t, a, b, n):
         first = jnp.asarray(f(t, [a[0], b[1]]), float)
@@ -302,7 +302,7 @@ def unit(f, ways, how):
 
 
 def units(seed, start, stop, log):
-    """Marked functions beside plain ones, one program for each way."""
+    """Fused functions compared with plain ones, one program for each transformation."""
     functions = [draw(seed, index)[1][0] for index in range(start, stop)]
     for way in WAYS:
         with Path(log).open("a") as file:
@@ -331,13 +331,13 @@ def units(seed, start, stop, log):
 
 
 def _quickly():
-    """An environment in which LLVM does not optimise: what may end the process comes before it."""
+    """An environment in which LLVM does not optimise: abnormal ends happen earlier."""
     flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
     return {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
 
 
 def hunt_units(count, seed, each=25):
-    """Combinations run, those refused, the largest difference to plain functions, ends."""
+    """Numbers of combinations, of rejected ones, largest difference, and abnormal ends."""
     environment = _quickly() | {"POLHODE_PLAIN": "0"}
     ran = refused = 0
     largest, ends = 0.0, []
@@ -358,7 +358,7 @@ def hunt_units(count, seed, each=25):
 
 
 def hunt(count, seed, *, each=200, patience=120, plain=False):
-    """Verdicts of all cases: ``{case: words}``; what ended a child is ``ENDED`` or ``STUCK``."""
+    """Results of all cases: ``{case: words}``; ``ENDED`` or ``STUCK`` for an unfinished child."""
     total, start, found = count * len(OF_SCENES), 0, {}
     environment = _quickly() | {"POLHODE_PLAIN": "1" if plain else "0"}
     with tempfile.TemporaryDirectory() as folder:

@@ -4,7 +4,7 @@ from collections import Counter
 
 
 def operations(jaxpr) -> Counter:
-    """Names of the primitives of a ``jaxpr`` and of those inside it, with their numbers."""
+    """Numbers of the primitives of a ``jaxpr`` and of those nested in it, by name."""
     total = Counter()
     for eqn in jaxpr.eqns:
         total[eqn.primitive.name] += 1

@@ -1,4 +1,4 @@
-"""Programs contain no operation for what a scene does not need."""
+"""Programs contain no operations that a scene does not need."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def test_rates_alone_carry_no_attitude_and_no_third_kind(costs):
 
 
 def test_symmetric_bodies_evaluate_no_elliptic_function(costs):
-    """No arithmetic-geometric mean: hardly a root is left, and few transcendental functions."""
+    """No arithmetic-geometric mean: almost no square roots, and few transcendental functions."""
     general = costs["free, final state"]
     for name in ("free, axisymmetric, final state", "free, spherical, final state"):
         assert costs[name]["flops"] < 0.15 * general["flops"]
@@ -50,12 +50,12 @@ def field_operations(scene):
     """Floating-point operations of one evaluation of the field for one body."""
     y = (tuple(jnp.ones(N) for _ in range(3)), tuple(jnp.ones(N) for _ in range(4)))
     system = Dynamics(scene.hamiltonian, scene.torque)
-    # before fusion: XLA works shared parts out anew in every output, which is not what is asked
+    # before fusion, since XLA then repeats shared parts in every output
     return jax.jit(lie_poisson_field).lower(0.0, y, system).cost_analysis()["flops"] / N
 
 
 def test_absent_parts_cost_no_operation():
-    """The free field costs what Euler's equations and the quaternion rate cost by hand: 39."""
+    """The free field has the operations of Euler's equations and the quaternion rate: 39."""
     inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
     free = field_operations(ph.Scene(inertia))
     by_hand = 3 + 9 + 3 + 24  # L/I; L x w; w/2; the quaternion product (negations count)

@@ -1,4 +1,4 @@
-"""Programs hold no callback of the host: they can be kept on disk, and exported."""
+"""Programs contain no host callback: they can be cached on disk, and exported."""
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,11 @@ SCENES = {
 
 
 @pytest.mark.parametrize(
-    ("kind", "what"),  # the program of a gradient holds that of the value
+    ("kind", "what"),  # the program of a gradient contains that of the value
     [("Lagrange", "value"), *((kind, "gradient") for kind in SCENES if kind != "Lagrange")],
 )
 def test_programs_are_exported_for_other_platforms(kind, what):
-    """With the tricks for processors in them or not: what is lowered has no custom call."""
+    """With and without CPU optimisations the lowered program has no custom call."""
     scene = ph.Scene(*SCENES[kind])
 
     def last(omega):

@@ -1,4 +1,4 @@
-"""Folding what does not depend on the state out of a field: same values, same slopes, less work."""
+"""Hoisting state-independent operations out of a field: same values and derivatives, less work."""
 
 import diffrax
 import jax
@@ -71,7 +71,7 @@ def test_value_and_slope_stay_those_of_the_field(name):
 
 
 def _arithmetic(closed):
-    """Operations on arrays of bodies."""
+    """Number of operations on arrays of bodies."""
     names = ("mul", "add", "sub", "neg", "div", "add_any")
     return sum(
         e.primitive.name in names and e.outvars[0].aval.shape == (N,) for e in closed.jaxpr.eqns
@@ -100,7 +100,7 @@ def test_the_derived_field_costs_what_the_one_written_by_hand_does():
 
 
 def test_folds():
-    """Zeros, ones, powers of two, chains of factors, calls and values that nothing folds."""
+    """Zeros, ones, powers of two, chains of factors, calls, and values that do not fold."""
 
     def fn(a, b, x, y):
         zero, one = jnp.zeros_like(x), jnp.ones_like(x)
@@ -140,7 +140,7 @@ def test_what_results_share_is_worked_out_once():
 
 
 def test_what_rests_on_the_same_arrays_is_worked_out_once():
-    """Calls of compiled functions too; numbers that differ in sign only are not the same."""
+    """Including calls of compiled functions; numbers that differ only in sign are different."""
 
     @jax.jit
     def wave(a, t):
@@ -174,8 +174,9 @@ def test_what_rests_on_the_same_arrays_is_worked_out_once():
     ids=["sums", "updates", "imaginary unit", "complex half"],
 )
 def test_fields_are_folded_to_the_same_numbers(fn):
-    """Operations on one number, broadcast to different shapes, are not the same one; factors of
-    complex numbers have no sign."""
+    """Operations on one number that is broadcast to different shapes are different; complex factors
+    have no sign.
+    """
     torque = ph.FeedbackTorque(lambda t, wxyz, omega_body: fn(omega_body))
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=torque)
     system = dynamics(scene)

@@ -10,7 +10,7 @@ from polhode.lightcurve._brightness import Bodies
 
 
 def problem(points, nights):
-    """Of a light curve with an offset for each night."""
+    """Least-squares problem of a light curve with an offset for each night."""
     t = np.linspace(0, nights, points)
     sun, observer = np.tile([1.0, 0, 0], (points, 1)), np.tile([0.6, 0.48, 0.64], (points, 1))
     curve = lightcurve.LightCurve.of(

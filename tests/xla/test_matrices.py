@@ -1,4 +1,4 @@
-"""LAPACK is called for one matrix at a time: a batch of them could wait for itself for ever."""
+"""LAPACK is called for one matrix at a time: batched calls may deadlock."""
 
 import re
 
@@ -23,13 +23,13 @@ SPD = BATCH @ np.swapaxes(BATCH, -1, -2) + np.eye(4)
 
 @pytest.fixture
 def affected(monkeypatch):
-    """As with a jaxlib that shares the matrices of a batch among threads, whichever is here."""
+    """Behave as with a jaxlib that distributes the matrices of a batch over threads."""
     monkeypatch.setattr(matrices, "_AFFECTED", True)
 
 
 def largest_batch(function, *args):
-    """Most matrices that a call of LAPACK in the program has, and how many calls there are."""
-    text = jax.jit(lambda *args: function(*args)).lower(*args).as_text()  # traced anew
+    """Largest number of matrices in a LAPACK call of the program, and number of calls."""
+    text = jax.jit(lambda *args: function(*args)).lower(*args).as_text()  # not cached
     calls = [line for line in text.splitlines() if "@lapack_" in line]
     shapes = [
         [int(size) for size in shape.split("x")[:-1]]
@@ -47,7 +47,7 @@ def recordings(count):
     return stack([Recording.of(times, k + rates, wheel_speed=100 * times) for k in range(count)])
 
 
-@pytest.mark.slow  # the matrices alone: below
+@pytest.mark.slow  # faster: the matrices alone, below
 @pytest.mark.parametrize("fit", ["fit_each", "fit_together"])
 def test_the_fits_hand_over_no_batch(affected, fit):
     options = FitOptions(FreeMotion(), FullTensor())

@@ -1,4 +1,4 @@
-"""Programs of orbits: no loops, no equation of Kepler for a circle, and one copy of each orbit."""
+"""Programs of orbits: no loops, no Kepler equation for a circle, and one copy of each orbit."""
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +52,7 @@ def test_a_circle_solves_no_equation():
 
 @pytest.fixture
 def copies(monkeypatch):
-    """Of every field that is specialised the logarithms: one in each Kepler's equation."""
+    """Number of logarithms in every specialised field: one for each Kepler equation."""
     found = []
     for module in (_field, _flow_derivative, _problem):
         original = module.specialise
@@ -70,7 +70,7 @@ def copies(monkeypatch):
 
 @pytest.mark.slow
 def test_one_copy_in_the_field(copies):
-    """Plainly, under jit, vmap and grad, for one orbit and for one of each body."""
+    """Eagerly, under jit, vmap and grad, for one orbit and for one orbit per body."""
     orbit, several = orbit_of(0.1), orbit_of(0.1, jnp.array([2.0, 2.1, 2.2]))
     scene, scenes = scene_of(orbit, orbit, orbit), scene_of(several, several)
 
@@ -94,8 +94,9 @@ def test_one_copy_in_the_field(copies):
 
 
 def test_a_table_fits_into_a_fused_kernel():
-    """Also while it is looked up: a comparison in the total order of floats, as in
-    ``jnp.searchsorted``, made the whole field of a satellite run apart, eleven times slower."""
+    """Including the search: a comparison in the total order of floats, as in ``jnp.searchsorted``,
+    would run the field of a satellite unfused, eleven times as slow.
+    """
     times = np.linspace(0.0, 3600.0, 61)
     for order in (1, 3):
         table = ph.Table(times, np.sin(np.outer(times, [1e-3, 2e-3, 3e-3])), order=order)
@@ -105,6 +106,6 @@ def test_a_table_fits_into_a_fused_kernel():
 
 @pytest.mark.parametrize("number", [3.0, 3, np.float64(3.0), [3.0], np.array([3.0])])
 def test_a_number_in_a_traced_function_fits_into_a_fused_kernel(number):
-    """``jax.device_put`` of a Python number would be an operation of its own."""
+    """``jax.device_put`` of a Python number would be a separate operation."""
     program = jax.make_jaxpr(lambda x: x * as_float_array("number", number))(1.0)
     assert is_fusible(program.jaxpr)

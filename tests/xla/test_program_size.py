@@ -1,4 +1,4 @@
-"""What a program contains: evaluations of the field, and nothing that is not requested."""
+"""Contents of programs: evaluations of the field, and nothing that is not requested."""
 
 import equinox as eqx
 import jax
@@ -15,14 +15,14 @@ POSITION, VELOCITY, TIME = np.array([1.0, -2.0, 0.5]), np.array([0.4, 0.3, -0.2]
 
 
 class Marked(eqx.Module):
-    """A torque of the user's with an operation that nothing else has."""
+    """A user-defined torque with an operation that occurs nowhere else."""
 
     def __call__(self, t, wxyz, omega):
         return -0.1 * jax.scipy.special.erf(omega)
 
 
 def places(scene, bodies):
-    """Evaluations of the torque in the program of the motion of a batch."""
+    """Number of evaluations of the torque in the program for a batch."""
 
     def end(omega):
         state = ph.State([1.0, 0, 0, 0], omega)
@@ -36,8 +36,9 @@ def places(scene, bodies):
 
 def test_the_field_stands_in_few_places():
     """Few bodies: once, in the loop over the stages of a step. A batch: one evaluation at the
-    start, of which the order follows, one that sorts the bodies, three in the columns of a step and
-    one after it."""
+    start, which determines the order of the steps, one to sort the bodies, three in the columns of
+    a step, and one after it.
+    """
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, ph.FeedbackTorque(Marked()))
     assert places(scene, 1) == 1
     assert places(scene, 100) == 6
@@ -57,7 +58,7 @@ def test_rates_alone_compile_to_less():
 
 
 def _multiplications(frame, moving: bool) -> int:
-    """Products in the compiled-to-be program, nested calls included."""
+    """Products in the traced program, including nested calls."""
 
     def program(t, position, velocity):
         return frame.apparent_acceleration(t, position, velocity if moving else None)

@@ -1,4 +1,4 @@
-"""Operations that XLA removes on other devices than the one that runs the tests."""
+"""Operations that XLA removes on devices other than the one that runs the tests."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from polhode._kernels import subjaxprs
 
 
 def _conversions(jaxpr):
-    """First and last dtype of every value that is converted twice in a row."""
+    """First and last dtype of every value that is converted twice in succession."""
     found, again = {}, []
     for equation in jaxpr.eqns:
         for inner in subjaxprs(equation):
@@ -21,7 +21,7 @@ def _conversions(jaxpr):
 
 
 def test_rates_are_not_rounded_by_a_conversion_there_and_back():
-    """XLA removes one on a GPU, and the digits beyond single precision with it."""
+    """On a GPU XLA removes such a pair, and with it the digits beyond single precision."""
     double = (jnp.ones(2, jnp.float64),) * 3
     made = jax.make_jaxpr(_rounded_constants)(double, double, (*double, double[0]))
     there_and_back = jax.make_jaxpr(lambda x: x - x.astype(jnp.float32).astype(jnp.float64))

@@ -1,4 +1,4 @@
-"""The marked call: whatever XLA folds away, the process lives and the values stay."""
+"""Fused kernels: whatever XLA simplifies, the process survives and the values are unchanged."""
 
 import functools
 import subprocess
@@ -18,9 +18,9 @@ from polhode._kernels import _fused, kernel, linear, opaque_ones, specialise, sp
 HERE = Path(__file__).parent
 
 
-@pytest.mark.slow  # random ones: test_a_seeded_slice_of_the_fuzz
+@pytest.mark.slow  # faster: random ones, test_a_seeded_slice_of_the_fuzz
 def test_units_that_fold_away():
-    """In a process of its own; `folding_units.py each` names the unit that ends it."""
+    """In its own process; `folding_units.py each` names the kernel that ends it."""
     ran = subprocess.run(
         [sys.executable, HERE / "folding_units.py"],
         capture_output=True,
@@ -56,7 +56,7 @@ def test_one_variable_switches_all_off(monkeypatch):
 
 
 def test_no_operation_of_an_orbit_keeps_it_out_of_a_unit():
-    """Kepler's equation takes cube roots and inverse hyperbolic functions."""
+    """Kepler's equation uses cube roots and inverse hyperbolic functions."""
     orbits = {
         "ellipse": ph.KeplerOrbit(1.0, 2.0, 0.1),
         "fly-by": ph.HyperbolicOrbit(1.0, -2.0, 1.4),
@@ -105,7 +105,7 @@ def test_a_linear_map_is_compiled_as_asked_and_differentiated_as_written():
 
 
 def test_what_bodies_share_stays_shared_in_a_batch_of_units():
-    """With times of its own each body would take its own steps backwards: 1.7 times as long."""
+    """With unshared times each body would take its own backward steps: 1.7 times as long."""
     batched = jnp.ones((4, 3)), jnp.ones(3)
     depends = _fused._batched_results(
         lambda x, t: [x * t, jnp.sin(t), jax.lax.cond(t[0] > 0, lambda: x, lambda: 2 * x), t],
@@ -147,7 +147,7 @@ def test_special_functions_in_units(name):
 @pytest.mark.parametrize("kind", ["free", "lagrange", "damped"])
 @pytest.mark.slow
 def test_no_traced_value_outlives_its_program(kind):
-    """Of exact and of stepped motions."""
+    """For closed forms and integrated motions."""
     force = ph.UniformGravity.axial(1.0, 0.5) if kind == "lagrange" else None
     drag = ph.LinearDamping(0.1) if kind == "damped" else None
     state = ph.State([1.0, 0.0, 0.0, 0.0], [0.1, 1.0, 0.1])
@@ -166,8 +166,9 @@ def test_no_traced_value_outlives_its_program(kind):
 
 @pytest.mark.parametrize("times", [2, 20])
 def test_one_body_is_few_tasks_of_the_processor(times):
-    """XLA hands what is more than eight tasks with arrays above 512 bytes to several threads, which
-    takes longer than the motion."""
+    """XLA distributes more than eight tasks with arrays above 512 bytes over several threads, which
+    takes longer than the motion.
+    """
     drag = ph.LinearDamping(0.1)
     scene = ph.Scene(
         ph.Inertia.from_moments([1.0, 1.5, 2.0]), ph.UniformGravity(1, [0, 0, 1]), drag
@@ -187,8 +188,9 @@ def test_one_body_is_few_tasks_of_the_processor(times):
 
 
 def test_a_batch_of_batches_is_too_wide_for_a_unit():
-    """XLA sums many numbers by a call of a library, which a unit cannot contain: it is no unit as
-    soon as a batch, around another batch that is one, makes its sums too wide."""
+    """XLA sums many numbers by a library call, which a fused kernel cannot contain: nested batches
+    whose sums become too wide are not fused.
+    """
 
     def power(weights, rows):
         def step(_, rows):
@@ -211,7 +213,7 @@ def test_a_batch_of_batches_is_too_wide_for_a_unit():
 
 
 def _units(jaxpr):
-    """The results' leading axes of every unit in a program."""
+    """Leading axes of the results of every fused kernel in a program."""
     for equation in jaxpr.eqns:
         if equation.primitive.name == "unit":
             yield {v.aval.shape[0] for v in equation.outvars if v.aval.ndim}
@@ -228,7 +230,7 @@ SYMMETRIC = ph.Inertia.axisymmetric(1.0, 1.5)
 
 
 def large_batch(inertia, torque):
-    """A motion of one body, and attitudes and rates of more bodies than a unit takes."""
+    """Motion of one body, and attitudes and rates of more bodies than a fused kernel contains."""
     bodies = 2 * _policy.KERNEL_BATCH + 1
     scene = ph.Scene(inertia, torque=torque)
     keys = jax.random.split(jax.random.key(0))
@@ -246,7 +248,7 @@ def large_batch(inertia, torque):
     ids=["symmetric", "free", "damped"],
 )
 def test_a_large_batch_is_a_loop_of_units(inertia, torque):
-    """Outside of a unit XLA repeats arithmetic: 256 free bodies under vmap took 300 ms, not 3."""
+    """Unfused, XLA repeats arithmetic: 256 free bodies under vmap took 300 ms, not 3."""
     motion, wxyz, omega = large_batch(inertia, torque)
     sizes = set().union(*_units(jax.make_jaxpr(jax.vmap(motion))(wxyz, omega).jaxpr))
     assert -(-len(wxyz) // 3) in sizes
@@ -264,7 +266,7 @@ def test_a_large_batch_is_a_loop_of_units(inertia, torque):
     ids=["symmetric", "free", "damped"],
 )
 def test_values_and_gradients_of_a_loop_of_units(inertia, torque):
-    """Those of the same bodies as one batch."""
+    """They equal those of the same bodies as one batch."""
     motion, wxyz, omega = large_batch(inertia, torque)
 
     def slopes(motion):
@@ -280,7 +282,7 @@ def test_values_and_gradients_of_a_loop_of_units(inertia, torque):
 
 
 def test_tops_at_rest_or_without_weight_are_corrected_body_by_body():
-    """Side by side that branch is a third of what a batch of tops compiles."""
+    """In parallel, that branch would be a third of the compiled program of a batch of tops."""
     scene = ph.Scene(SYMMETRIC, ph.UniformGravity.axial(1.0, 0.5))
     state = ph.State(jnp.ones((5, 4)), jnp.ones((5, 3)))
     program = jax.make_jaxpr(lambda s: ph.simulate(scene, s, jnp.array([0.0, 1.0])).wxyz)(state)
@@ -292,7 +294,7 @@ def test_tops_at_rest_or_without_weight_are_corrected_body_by_body():
 
 
 def test_stages_stay_under_vmap_and_in_derivatives():
-    """A division by ones that are broadcast would become a multiplication, and be repeated."""
+    """A division by broadcast ones would become a multiplication, and be repeated."""
 
     def plain(x):
         return jnp.sin(x) * jnp.cos(x) + jnp.exp(jnp.cos(x))
@@ -315,7 +317,7 @@ def test_stages_stay_under_vmap_and_in_derivatives():
 
 
 def test_a_derivative_that_no_unit_can_hold_is_none():
-    """XLA's units know no sort: one in a rule of derivatives alone ended the first gradient."""
+    """Fused kernels cannot contain a sort, which may occur only in a derivative rule."""
 
     @jax.custom_jvp
     def total(x):
@@ -332,7 +334,7 @@ def test_a_derivative_that_no_unit_can_hold_is_none():
 
 @pytest.mark.parametrize("how", [{"linearised": True}, {"repeated": True}, {"of_units": True}])
 def test_second_derivatives_of_units_in_a_loop(how):
-    """JAX traces the first one of a loop's body without knowing that there will be a second."""
+    """JAX traces the first derivative of a loop's body without knowing of a second one."""
 
     def plain(x):
         return jnp.sin(x) ** 2 * jnp.exp(x)
@@ -348,7 +350,7 @@ def test_second_derivatives_of_units_in_a_loop(how):
 
 @pytest.mark.parametrize("bodies", [4, 20])
 def test_a_batch_of_units_updates_slices_at_places_of_its_own(bodies):
-    """Which ``vmap`` turns into a scatter, which no unit can hold."""
+    """``vmap`` turns these into a scatter, which a fused kernel cannot contain."""
 
     def updated(x, place):
         return jax.lax.dynamic_update_slice(jnp.sin(x), 2 * x[:1], (place,))
@@ -359,7 +361,7 @@ def test_a_batch_of_units_updates_slices_at_places_of_its_own(bodies):
 
 
 def test_units_within_a_unit():
-    """They stay units, in its derivatives too; a known table stands inside."""
+    """Nested kernels remain fused, also in derivatives; a constant table is inside."""
     table, wide = jnp.arange(3.0), jnp.arange(2000.0)
     inner = kernel(lambda x: jnp.sin(x) * table)
     outer = kernel(lambda x: inner(x) + 2 * inner(x * x) + wide[7], of_units=True)
@@ -382,7 +384,7 @@ def test_units_within_a_unit():
 
 @pytest.mark.parametrize(("bodies", "times"), [(3, 2), (100, 61)])
 def test_units_that_repeat_their_work_in_derivatives(bodies, times):
-    """Gradients of any size stay units: what is spread over times is summed inside of one."""
+    """Gradients of any size are fused: sums over the times of the samples are inside."""
 
     def motion(a, b, t):
         a, b, c = *spread((a, (jnp.sin(a * b), b > 0)), -1, times), spread(b, -1, times)
@@ -419,7 +421,7 @@ def test_units_that_repeat_their_work_in_derivatives(bodies, times):
     "derivative", [jax.grad, pytest.param(jax.hessian, marks=pytest.mark.slow)]
 )
 def test_derivatives_of_a_free_body_are_units(derivative):
-    """Outside of units what several results need is repeated: Hessians took minutes to compile."""
+    """Unfused, work that several results need is repeated: Hessians took minutes to compile."""
 
     def end(x):
         inertia = ph.Inertia.from_moments(x[:3])
@@ -434,12 +436,12 @@ def test_derivatives_of_a_free_body_are_units(derivative):
     sizes = {f.split("(")[0].split("@")[-1]: len(f.splitlines()) for f in functions if "@" in f}
     assert len(units) == 2
     assert sum(sizes[name] for name in units) > 4000
-    # functions that others call stand inside of units too, but are short
+    # functions that others call are inside fused kernels too, but are short
     assert max(size for name, size in sizes.items() if name not in units) < 500
 
 
 def test_a_seeded_slice_of_the_fuzz():
-    """`fuzz.py` does thousands."""
+    """`fuzz.py` runs thousands."""
     ran, refused, largest, ends = fuzz.hunt_units(8, seed=7, each=8)
     assert not ends
     assert ran + refused == 8 * len(fuzz.WAYS)
@@ -448,7 +450,7 @@ def test_a_seeded_slice_of_the_fuzz():
 
 
 def test_a_thrust_of_zero():
-    """The torque is nothing, which XLA sees and the traced program does not show."""
+    """XLA recognises that the torque is zero, which the traced program does not show."""
     torque = ph.BodyTorque(lambda t: jnp.where(t < 1, 0.0, 0.0) * jnp.array([0.0, 0.0, 1.0]))
     inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
     state = ph.State([1.0, 0.0, 0.0, 0.0], [0.1, 1.0, 0.1])

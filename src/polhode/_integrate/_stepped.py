@@ -118,10 +118,10 @@ class AbstractIntegration(AbstractMethod):
                 f" {', '.join(hidden_operations)}, in which kinks cannot be located"
             )
         if is_few or switches:
-            ending = f", each ending where one of {switches} switches (clip, where, ...) turns"
+            ending = f", each ending where one of {switches} switches (clip, where, ...) changes"
             order = 5 if self._automatic.rule(switches) is TSIT5 else 8
             return f"explicit Runge-Kutta steps of order {order}" + (ending if switches else "")
-        carried = ", its rounding carried along" if self._automatic.compensated else ""
+        carried = ", with compensated summation" if self._automatic.compensated else ""
         return f"extrapolated midpoint rule{carried}"
 
     @property

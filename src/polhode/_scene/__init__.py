@@ -1,6 +1,7 @@
-"""Scenes and states, and what they are made of: potentials, torques, damping, rotors.
+"""Scenes and states, and their parts: potentials, torques, damping, rotors.
 
-The names are imported at first use, so that a free body does not wait for control laws and orbits.
+The names are imported on first use, so that scenes of torque-free bodies do not import control laws
+and orbits.
 """
 
 import lazy_loader

@@ -33,8 +33,8 @@ _ORIGIN = (0.0, 0.0, 0.0)
 class Pointing(AbstractTorque):
     """A PD control law for the attitude: N = -2 kp e - kd omega in body axes.
 
-    e is the vector part of the quaternion from the attitude ``target`` to that of the body, of the
-    sign of the shorter rotation: for small angles the torque is kp times the angle.
+    e is the vector part of the quaternion from the attitude ``target`` to that of the body, with
+    the sign of the shorter rotation: for small angles the torque is kp times the angle.
 
     **Arguments:** ``kp`` [N m/rad] and ``kd`` [N m s], (..., 3) or one number for the same about
     every axis, not negative; ``target`` (..., 4): ``wxyz`` body -> space. At exactly half a
@@ -46,7 +46,7 @@ class Pointing(AbstractTorque):
     Raises ValueError for negative gains or a zero quaternion.
     """
 
-    smooth: ClassVar[bool] = False  # the shorter way to the target changes at half a turn
+    smooth: ClassVar[bool] = False  # the torque changes sign at half a turn from the target
 
     kp: Float[Array, "*#b 3"] = shaped(3)
     kd: Float[Array, "*#b 3"] = shaped(3)
@@ -112,8 +112,8 @@ class MagneticDipole(AbstractTorque):
     omega_body, field_body)`` -> (3,) of one body, such as ``ph.BDot``; ``field``: in space axes,
     [T], constant (..., 3), a function ``fn(position, t)`` -> (3,), such as ``ph.DipoleField``, or a
     ``ph.Table`` over time;
-    ``position``: where the body is [m], space axes, constant (..., 3), a function of time or an
-    orbit such as ``ph.KeplerOrbit``, for a field that is a function.
+    ``position``: of the body [m], space axes, constant (..., 3), a function of time or an orbit
+    such as ``ph.KeplerOrbit``, for a field that is a function.
 
         orbit = ph.KeplerOrbit(3.986e14, 6.9e6, inclination=1.7)
         field = ph.DipoleField([0, 0, -7.8e22])
@@ -173,11 +173,12 @@ class MagneticDipole(AbstractTorque):
 class BDot(eqx.Module):
     """Magnetic moment that detumbles a body: m = k omega x B [A m^2].
 
-    That is -k times the rate of B in body axes where B hardly changes in space. The change of B
-    along an orbit, which magnetometers also show, is not included: with it the body comes to rest
-    relative to the field, at about twice the orbital rate, not in space. ``k`` [A m^2 s/T] (a
-    number, a leaf that gradients tune); ``max_moment`` [A m^2]: limit of each of three rods, or
-    None. For ``ph.MagneticDipole``: the torque is -k |B|^2 times the part of omega normal to B.
+    That is -k times the rate of change of B in body axes if B is nearly constant in space. The
+    change of B along an orbit, which a magnetometer also measures, is not included: with it the
+    body would come to rest relative to the field, at about twice the orbital rate, not in space.
+    ``k`` [A m^2 s/T]: a number, a leaf for gradients; ``max_moment`` [A m^2]: limit of each of
+    three rods, or None. For ``ph.MagneticDipole``: the torque is -k |B|^2 times the component of
+    omega normal to B.
     """
 
     k: Array
@@ -209,7 +210,7 @@ class DipoleField(eqx.Module):
     def __call__(self, position: Array, t: Array | float) -> Array:
         size = jnp.sqrt(jnp.sum(position * position))
         n = position / size
-        # factor by factor: the derivative of x / size**3 holds size**-6, subnormal in float32
+        # separate factors: the derivative of x / size**3 contains size**-6, subnormal in float32
         inverse = 1 / size
         field = 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment)
         return field * inverse * inverse * inverse
@@ -222,10 +223,10 @@ class Motor(AbstractCoupling):
     """A motor between body and wheel, with limits of torque and speed.
 
     **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
-    function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
-    it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
-    [rad/s], positive: the accelerating torque falls linearly to zero there (the line of a DC
-    motor); the braking torque does not. It needs ``max_torque``.
+    function ``fn(t, wxyz, omega_body, speed)`` of one body and the wheel's speed [rad/s] relative
+    to it; ``max_torque`` (...) [N m], positive: limit of the torque; ``max_speed`` (...) [rad/s],
+    positive: the accelerating torque falls linearly to zero at this speed (the characteristic of a
+    DC motor), the braking torque does not. It needs ``max_torque``.
 
     A wheel that controls the attitude, with friction in its bearing:
 
@@ -342,7 +343,7 @@ def wheel_cluster(
     [rad/s], (n,) or one number; ``max_torque`` of each motor [N m], (n,) or one number, or None;
     ``friction`` of each bearing, such as ``ph.ViscousCoupling``; ``null_gain`` [1/s] and ``bias``
     [rad/s], (n,) or one number: null motion drives the speeds to the bias as far as that exerts no
-    torque on the body; ``first``: the number of other wheels that stand before these in the scene.
+    torque on the body; ``first``: the index of the first of these wheels among those of the scene.
     All bodies of a batch share these numbers.
 
     The wheels share the command by the pseudo-inverse of their axes, with the least sum of squares
@@ -375,8 +376,9 @@ def wheel_cluster(
     )
     gain = as_number("wheel_cluster null_gain", null_gain)
     law = _CLUSTER_COMMAND.checked(command)
-    # u = -A^+ N exerts N = -A u; rows of 1 - A^+ A are motions of the wheels without a torque.
-    # Momenta, not speeds, have to cancel: the projector acts on J times the speeds.
+    # Motor torques u = -A^+ N exert N = -A u on the body; the rows of 1 - A^+ A are motor torques
+    # without a torque on the body. The projector acts on the momenta J Omega, because these, not
+    # the speeds, must cancel.
     inverse = jnp.linalg.solve(directions.T @ directions, directions.T).T
     projector = jnp.eye(n, dtype=directions.dtype) - inverse @ directions.T
     limits: Any = [None] * n
@@ -393,7 +395,7 @@ def wheel_cluster(
 
 
 def _for_each_wheel(name: str, value: ArrayLike, n: int) -> Array:
-    """Numbers (n,) from one for all wheels, or one each."""
+    """Numbers (n,), from one number for all wheels or one for each."""
     array = as_float_array(name, value)
     if array.shape not in ((), (n,)):
         raise ValueError(
@@ -405,10 +407,10 @@ def _for_each_wheel(name: str, value: ArrayLike, n: int) -> Array:
 class MomentumDumping(AbstractTorque):
     """Magnetorquers that remove the momentum of the wheels: m = -k (B x h)/|B|^2, N = m x B.
 
-    h is the momentum of the wheels of the scene: J Omega along the axis a of a wheel of prescribed
-    speed Omega relative to the body, and J (Omega + a . omega), the rotation of the body included,
-    of a wheel with a motor, a torque or a coupling. The torque is -k times the part of h normal to
-    the field, which the wheels counteract, so that they lose momentum.
+    h is the momentum of the scene's wheels along their axes a: J Omega for a wheel of prescribed
+    speed Omega relative to the body, and J (Omega + a . omega), including the rotation of the body,
+    for a wheel with a motor, a torque or a coupling. The torque is -k times the component of h
+    normal to the field. The wheels counteract it and thereby lose momentum.
 
     **Arguments:** ``k`` (...) [1/s], not negative; ``field`` and ``position``: as in
     ``ph.MagneticDipole``; ``max_moment`` (...) [A m^2]: limit of each of three rods, or None.
@@ -464,16 +466,16 @@ class MomentumDumping(AbstractTorque):
 
 
 class ControlMomentGyro(AbstractTorque):
-    """A single-gimbal control moment gyroscope: a wheel of constant momentum on a turning axis.
+    """A single-gimbal control moment gyroscope: a wheel of constant momentum on a rotating axis.
 
     h(t) = momentum (cos(angle) spin + sin(angle) gimbal x spin) in body axes, and the torque on the
-    body is N = -dh/dt - omega x h. The momenta of a trajectory are those of the body without h.
+    body is N = -dh/dt - omega x h. The momenta of a trajectory do not include h.
 
     **Arguments:** ``momentum`` (...) [kg m^2/s]: of the wheel; ``gimbal`` (..., 3): axis of the
     gimbal, body axes; ``spin`` (..., 3): axis of the wheel at the angle zero, normal to the gimbal;
     both are normalised; ``angle``: of the gimbal [rad], a function of time [s] that JAX can
-    differentiate, or a ``ph.Table``. The inertia of the gimbal is part of the body's and taken as
-    constant.
+    differentiate, or a ``ph.Table``. The inertia of the gimbal is part of that of the body and
+    assumed to be constant.
 
         gyro = ph.ControlMomentGyro(2.0, [0, 0, 1.0], [1.0, 0, 0], lambda t: 0.3 * jnp.sin(t))
 

@@ -31,15 +31,15 @@ from polhode._scene._torques import AbstractTorque, stacked, vector_of_time
 def anomaly_at_periapsis(mean: Array, gap: Array, eccentricity: Array, hyperbolic: bool) -> Array:
     """Eccentric (hyperbolic) anomaly for a mean anomaly, without loops and without derivatives.
 
-    ``mean`` [rad], of an ellipse within [-pi, pi]; ``gap``: |1 - e|, which the caller knows without
-    cancellation. The relative error is below 1e-13 (ellipses) and 1e-16 (hyperbolas) plus rounding.
+    ``mean`` [rad], for an ellipse within [-pi, pi]; ``gap``: |1 - e|, computed without
+    cancellation. The relative error is below 1e-13 (ellipses) or 1e-16 (hyperbolas) plus rounding.
     F. L. Markley, Celest. Mech. Dyn. Astr. 63 (1995) 101, for the starting value of ellipses.
     """
     sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
     m = jnp.abs(mean)
     if hyperbolic:
-        # e sinh F - F exceeds (e - 1) F + e F^3/6, so that the root of this cubic exceeds F, and so
-        # does asinh((M + root)/e), by less than 2 per cent
+        # e sinh F - F exceeds (e - 1) F + e F^3/6, so that the root of this cubic exceeds F;
+        # asinh((M + root)/e) exceeds it by less than 2 per cent
         p, h = 2 * gap / eccentricity, 3 * m / eccentricity
         w = _power(h + jnp.sqrt(h * h + p * p * p), 1 / 3)
         x = jnp.arcsinh((m + 2 * h / (w * w + p + p * p / (w * w))) / eccentricity)
@@ -60,11 +60,12 @@ def anomaly_at_periapsis(mean: Array, gap: Array, eccentricity: Array, hyperboli
 def passed_anomaly(
     x: Array, mean: Array, gap: Array, a: Array, b: Array | float, hyperbolic: bool
 ) -> tuple[Array, Array]:
-    """sin x and 1 - cos x, where x - a sin x + b (1 - cos x) = mean; ``x``: nearly the root.
+    """sin x and 1 - cos x for the root of x - a sin x + b (1 - cos x) = mean near ``x``.
 
-    Of hyperbolas sinh x and cosh x - 1, where a sinh x + b (cosh x - 1) - x = mean. ``gap``:
-    |1 - a|. The derivatives up to the third with respect to the other arguments are right: the
-    correction of a constant x is of fourth order. The rounding of x does not enter the results.
+    For hyperbolas sinh x and cosh x - 1 for the root of a sinh x + b (cosh x - 1) - x = mean.
+    ``gap``: |1 - a|. ``x`` is a constant with a correction of fourth order, so that derivatives
+    with respect to the other arguments are correct up to the third, and the rounding error of ``x``
+    does not affect the results.
     """
     x = jax.lax.stop_gradient(x)
     sine, turn, lag = _functions(x, hyperbolic)
@@ -78,9 +79,9 @@ def passed_anomaly(
 
 
 def _correction(functions, x, mean, gap, a, b, hyperbolic: bool) -> Array:
-    """Change of x to the root of the equations above, of fourth order in its error.
+    """Change from x to the root of the equations of ``passed_anomaly``, of fourth order.
 
-    Newton's step u with the first terms of the inverse series, u - f2 u^2/(2 f1) + ...
+    It is the Newton step u with the first terms of the inverse series, u - f2 u^2/(2 f1) + ...
     """
     sine, turn, lag = functions
     curved = 1 if hyperbolic else -1
@@ -93,11 +94,11 @@ def _correction(functions, x, mean, gap, a, b, hyperbolic: bool) -> Array:
 
 
 def _functions(x: Array, hyperbolic: bool) -> tuple[Array, Array, Array]:
-    """sin x, 1 - cos x and x - sin x without cancellation; of hyperbolas sinh x, cosh x - 1 and
+    """sin x, 1 - cos x and x - sin x without cancellation; for hyperbolas sinh x, cosh x - 1 and
     sinh x - x."""
     square = x * x
     if hyperbolic:
-        # of exponentials of |x|/2 itself: those of JAX add a logarithm of 2, which costs digits
+        # from expm1(|x|/2): JAX computes sinh with exp(x - log 2), which loses digits
         growth = jnp.expm1(jnp.abs(x) / 2)
         half = jnp.sign(x) * (growth + growth / (1 + growth)) / 2
         sine, series_bound = half * (1 + growth + 1 / (1 + growth)), 3
@@ -111,7 +112,7 @@ def _functions(x: Array, hyperbolic: bool) -> tuple[Array, Array, Array]:
 
 
 def _series(square: Array) -> Array:
-    """(sinh x - x)/x^3 of x^2 within [-10, 3]; what is left out is below 1e-18."""
+    """(sinh x - x)/x^3 as a function of x^2 within [-10, 3]; truncation error below 1e-18."""
     total = jnp.zeros_like(square)
     for k in range(14, -1, -1):
         total = 1 / math.factorial(2 * k + 3) + square * total
@@ -119,19 +120,19 @@ def _series(square: Array) -> Array:
 
 
 def _power(x: Array, exponent: float) -> Array:
-    """Of a positive number, to a few digits fewer than ``jnp.power``, which takes longer."""
+    """Power of a positive number: a few digits less accurate than ``jnp.power``, but faster."""
     return jnp.exp(exponent * jnp.log(x))
 
 
 def _within_a_turn(angle: Array) -> Array:
-    """The angle [rad] plus whole turns, within [-pi, pi]."""
-    for _ in range(2):  # after a large angle's rounding error may be several turns
+    """The angle [rad] modulo whole turns, within [-pi, pi]."""
+    for _ in range(2):  # twice, since for a large angle the first result may have turns left over
         angle = angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
     return angle
 
 
 def _from_one(eccentricity: Array, hyperbolic: bool) -> Array:
-    """|1 - e|, exact near one."""
+    """|1 - e|, exact for e near one."""
     return eccentricity - 1 if hyperbolic else 1 - eccentricity
 
 
@@ -158,17 +159,17 @@ class KeplerOrbit(AbstractOrbit):
 
     ``KeplerOrbit(...)`` takes orbital elements, ``KeplerOrbit.from_state(...)`` a position and a
     velocity. Use it in ``ph.GravityGradient(mu, orbit)``, ``ph.LVLH(orbit)`` and
-    ``ph.MagneticDipole``; these take a function of time [s] too, for an orbit that is no conic.
+    ``ph.MagneticDipole``; for other orbits these also accept a function of time [s].
 
     **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m];
     ``eccentricity`` in [0, 1) (hyperbolas: ``ph.HyperbolicOrbit``); ``inclination``,
     ``node`` (longitude of the ascending node), ``periapsis`` (its argument), ``mean_anomaly`` at
-    the time ``epoch`` [rad, s], counted from periapsis. Space axes: z is the pole that the
-    inclination is counted from, x the direction that the node is counted from.
+    the time ``epoch`` [rad, s], measured from periapsis. Space axes: the inclination is measured
+    from z, the node from x.
 
-    Without an ``eccentricity`` (None) the orbit is a circle by construction: no equation is solved,
-    and there is no derivative with respect to the eccentricity, as there is with 0.0. The argument
-    of latitude is then ``periapsis`` plus the mean anomaly.
+    Without an ``eccentricity`` (None) the orbit is a circle by construction: Kepler's equation is
+    not solved, and unlike with 0.0 there is no derivative with respect to the eccentricity. The
+    argument of latitude is then ``periapsis`` plus the mean anomaly.
 
         orbit = ph.KeplerOrbit(3.986e14, 6.9e6, inclination=1.7)
         same = ph.KeplerOrbit.from_state(3.986e14, orbit(0.0), orbit.velocity_at(0.0))
@@ -209,7 +210,7 @@ class KeplerOrbit(AbstractOrbit):
         }
         dtype = jnp.result_type(*(x for x in numbers.values()))
         for name, value in numbers.items():
-            # a plain number stays one: it has no precision of its own
+            # a Python number remains weakly typed, so that it does not determine the precision
             setattr(self, name, value if value.weak_type else value.astype(dtype))
         require_positive("mu", self.mu)
         if self.eccentricity is None:
@@ -244,9 +245,9 @@ class KeplerOrbit(AbstractOrbit):
         """The conic through a position (..., 3) [m] with a velocity (..., 3) [m/s].
 
         ``mu`` (...) [m^3/s^2]; both from the attracting centre, in space axes, at the time
-        ``epoch`` (...) [s]. They are kept in place of elements, so that derivatives are regular
-        everywhere, also for circular and equatorial orbits, where elements are not. The orbits are
-        ellipses; of ``ph.HyperbolicOrbit`` hyperbolas.
+        ``epoch`` (...) [s]. They are stored in place of elements, so that derivatives are regular
+        also for circular and equatorial orbits, for which elements are singular. The orbits of
+        ``ph.KeplerOrbit`` are ellipses, those of ``ph.HyperbolicOrbit`` hyperbolas.
 
         Lagrange's f and g functions of the difference in eccentric or hyperbolic anomaly (R. H.
         Battin, An Introduction to the Mathematics and Methods of Astrodynamics, 1999).
@@ -311,7 +312,7 @@ class KeplerOrbit(AbstractOrbit):
 class HyperbolicOrbit(KeplerOrbit):
     """Position of a body on a hyperbola about an attracting centre, for fly-bys.
 
-    As ``ph.KeplerOrbit``, with an ``eccentricity`` above 1 and a negative ``semi_major_axis`` [m].
+    Arguments as for ``ph.KeplerOrbit``, with ``eccentricity`` > 1 and ``semi_major_axis`` < 0 [m].
 
         flyby = ph.HyperbolicOrbit.from_state(3.986e14, [3.8e7, 0, 0], [0, 7.4e3, 0])
 
@@ -397,7 +398,7 @@ def _by_state(orbit: Any, t: Array) -> Float[Array, "*b 3"]:
 
 
 def _nearly_passed(hyperbolic: bool, mean: Array, a: Array, b: Array, shape: Array) -> Array:
-    """Difference in anomaly since the epoch, nearly, without derivatives."""
+    """Approximate difference in anomaly since the epoch, without derivatives."""
     if hyperbolic:
         e = jnp.sqrt(1 + shape)
         at_epoch = jnp.arcsinh(b / e)
@@ -417,15 +418,16 @@ class LVLH(AbstractPart):
     """Local vertical, local horizontal: x forward, y against the orbit's momentum, z to the centre.
 
     z points to the attracting centre, y is opposite to r x v, and x, in the plane of the orbit,
-    completes them: on a circular orbit it is the direction of flight. As NASA's JEOD and the
-    space shuttle used it; yaw, pitch and roll are the angles ZYX of the body in it.
+    completes the right-handed frame: on a circular orbit it is the direction of flight. This is the
+    convention of NASA's JEOD and the space shuttle; yaw, pitch and roll are the angles ZYX of the
+    body in it.
 
     ``orbit``: ``ph.KeplerOrbit``, or a function of time [s] returning the position (3,) from the
     attracting centre [m], twice differentiable. Times are () or (..., T), with the axes of a batch
     of orbits first.
 
         frame = ph.LVLH(ph.KeplerOrbit(3.986004418e14, 6.8e6))
-        state = ph.State(*frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0))  # held in the frame
+        state = ph.State(*frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0))  # at rest in it
         roll = frame.yaw_pitch_roll(traj)[2]
 
     Conventions: NASA JSC, JEOD Dynamics: LVLH reference frame; D. A. Vallado, Fundamentals of
@@ -449,13 +451,13 @@ class LVLH(AbstractPart):
         if isinstance(self.orbit, KeplerOrbit):
             r = self.orbit(t)
             momentum, normal = jnp.broadcast_to(self.orbit.momentum, r.shape), None
-        else:  # what is no conic may leave its plane
+        else:  # other orbits may leave their plane
 
             def place_and_velocity(t):
                 return jax.jvp(place, (t,), (jnp.ones_like(t),))
 
             place = self.orbit
-            if not isinstance(place, AbstractPart):  # which carries batch axes itself
+            if not isinstance(place, AbstractPart):  # a part handles batch axes itself
                 place = jnp.vectorize(place, signature="()->(n)")
             (r, v), (_, force) = jax.jvp(place_and_velocity, (t,), (jnp.ones_like(t),))
             momentum = jnp.cross(r, v)
@@ -474,7 +476,7 @@ class LVLH(AbstractPart):
     def to_frame(
         self, wxyz: ArrayLike, omega_body: ArrayLike, t: ArrayLike
     ) -> tuple[Float[Array, "*b 4"], Float[Array, "*b 3"]]:
-        """Attitude body -> frame (..., 4), and rates of the body against the frame in body axes.
+        """Attitude body -> frame (..., 4), and rates relative to the frame in body axes.
 
         From attitude (..., 4) body -> space and body rates (..., 3) [rad/s] at times ``t``.
         """
@@ -485,10 +487,10 @@ class LVLH(AbstractPart):
     def from_frame(
         self, wxyz: ArrayLike, omega_body: ArrayLike, t: ArrayLike
     ) -> tuple[Float[Array, "*b 4"], Float[Array, "*b 3"]]:
-        """The inverse: attitude body -> space and body rates, ``ph.State(*frame.from_frame(...))``.
+        """Inverse of ``to_frame``: attitude body -> space and body rates, for ``ph.State``.
 
-        From attitude (..., 4) body -> frame, and rates (..., 3) [rad/s] against the frame in body
-        axes.
+        From attitude (..., 4) body -> frame, and rates (..., 3) [rad/s] relative to the frame in
+        body axes.
         """
         wxyz, omega, frame, rates = self._as_arrays(wxyz, omega_body, t)
         omega_space = omega + rotation.rotate(rotation.conjugate(wxyz), rates)
@@ -497,7 +499,7 @@ class LVLH(AbstractPart):
     def yaw_pitch_roll(self, trajectory: Any) -> tuple[Array, Array, Array]:
         """Angles ZYX [rad] of a trajectory's body axes in the frame, each (..., T)."""
         frame = self
-        if isinstance(self.orbit, AbstractPart):  # which may be one for each body
+        if isinstance(self.orbit, AbstractPart):  # may have one orbit for each body
             frame = LVLH(along_time(self.orbit, len(trajectory.batch_shape)))
         wxyz, _ = frame.to_frame(trajectory.wxyz, trajectory.omega_body, trajectory._t)
         return rotation.wxyz_to_euler(wxyz, rotation.Sequence.ZYX)
@@ -511,9 +513,9 @@ class LVLH(AbstractPart):
         return tuple(jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in (wxyz, omega, frame, rates))
 
 
-@jax.jit  # one program, not one for each operation
+@jax.jit  # outside jit too, one program for all operations
 def _axes(r: Array, momentum: Array, normal: Array | None) -> tuple[Array, ...]:
-    """``LVLH.axes`` by the place, the angular momentum, and the force along that, if any."""
+    """``LVLH.axes`` from position, angular momentum, and ``normal``: acceleration . momentum."""
     size = jnp.linalg.norm(momentum, axis=-1, keepdims=True)
     distance = jnp.linalg.norm(r, axis=-1, keepdims=True)
     z, y = -r / distance, -momentum / size
@@ -528,7 +530,7 @@ class RelativeTorque(AbstractTorque):
 
     ``RelativeTorque(ph.LinearDamping(c), frame)`` damps the rates relative to the frame;
     ``RelativeTorque(ph.FeedbackTorque(fn), frame)`` passes the attitude body -> frame and the rates
-    relative to the frame to ``fn``. A ``ph.SpaceTorque`` is then along the axes of the frame.
+    relative to the frame to ``fn``. The components of a ``ph.SpaceTorque`` are those in the frame.
 
     Raises TypeError for another kind of torque or frame.
     """
@@ -549,7 +551,7 @@ class RelativeTorque(AbstractTorque):
     ) -> tuple[Array, Array, Array]:
         *axes, rates = self.frame.axes(jnp.asarray(t, omega[0].dtype))
 
-        def quaternion():  # dear, and asked for by few
+        def quaternion():  # computed only if the torque needs it: most need rows of R alone
             frame = rotation.matrix_to_wxyz(jnp.stack(axes, axis=-1))
             body = stacked(attitude.wxyz)
             frame = jnp.broadcast_to(rotation.conjugate(frame), body.shape)

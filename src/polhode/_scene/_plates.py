@@ -1,4 +1,4 @@
-"""Air drag and solar radiation pressure on the flat plates that a spacecraft is made of."""
+"""Air drag and solar radiation pressure on a spacecraft modelled by flat plates."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
@@ -75,7 +75,7 @@ def number_of_time(name: str, value: Any) -> Array | Callable:
 
 
 def _direction_of_time(name: str, value: Any) -> Array | Callable:
-    """A vector of time that is not zero where it is constant."""
+    """``vector_of_time``; ValueError for a constant vector that is zero."""
     direction = vector_of_time(name, value)
     if not callable(direction) and is_concrete(direction):
         nonzero = np.any(np.asarray(direction) != 0, axis=-1)
@@ -84,7 +84,7 @@ def _direction_of_time(name: str, value: Any) -> Array | Callable:
 
 
 def number_at(name: str, value: Any, t: Array | float) -> Array:
-    """Such a number at the times ``t``."""
+    """Value of a ``number_of_time`` at the times ``t``."""
     if not callable(value):
         return value
     if isinstance(value, AbstractPart) and callable(value):
@@ -112,8 +112,8 @@ class Drag(AbstractTorque):
     **Arguments:** ``plates``: ``ph.Plates``; ``density`` [kg/m^3]: a number (...), a function of
     time [s] or a ``ph.Table``; ``velocity`` [m/s]: of the body relative to the air, space axes,
     (..., 3), a function of time -> (3,) or a ``ph.Table``; ``coefficient`` Cd: (p,) or one number,
-    2.2 by default. The rotation of the body is neglected against ``velocity``. The torque has a
-    kink where a plate turns away from the wind; steps end there.
+    2.2 by default. Velocities due to the rotation of the body are neglected. The torque has a kink
+    where a plate turns away from the flow; steps end there.
 
         air = ph.Drag(faces, density=1e-11, velocity=[7.6e3, 0.0, 0.0])
 
@@ -121,7 +121,7 @@ class Drag(AbstractTorque):
     Control, 2014, section 3.3.6.3. Raises TypeError or ValueError for other arguments.
     """
 
-    smooth: ClassVar[bool] = False  # plates turn away from the wind
+    smooth: ClassVar[bool] = False  # kinks where plates turn away from the flow
 
     plates: Plates = shaped()
     density: Float[Array, "*#b"] | Callable = shaped()
@@ -174,7 +174,7 @@ class SolarPressure(AbstractTorque):
     Control, 2014, section 3.3.6.4. Raises TypeError or ValueError for other arguments.
     """
 
-    smooth: ClassVar[bool] = False  # plates turn away from the Sun
+    smooth: ClassVar[bool] = False  # kinks where plates turn away from the Sun
 
     plates: Plates = shaped()
     direction: Float[Array, "*#b 3"] | Callable = shaped(3)
@@ -223,7 +223,7 @@ class SolarPressure(AbstractTorque):
 
 
 class Eclipse(AbstractPart):
-    """The shadow of a planet, a cylinder: 1 in sunlight and 0 in the shadow, of the time [s].
+    """The cylindrical shadow of a planet, a function of time [s]: 1 in sunlight, 0 in the shadow.
 
     **Arguments:** ``position`` [m]: of the body from the centre of the planet, space axes: an
     orbit, a function of time -> (3,), a ``ph.Table`` or (..., 3); ``direction``: to the Sun, space
@@ -235,7 +235,7 @@ class Eclipse(AbstractPart):
     Raises TypeError or ValueError for other arguments.
     """
 
-    smooth: ClassVar[bool] = False  # the edges of the shadow
+    smooth: ClassVar[bool] = False  # jumps at the edges of the shadow
 
     position: Float[Array, "*#b 3"] | Callable = shaped(3)
     direction: Float[Array, "*#b 3"] | Callable = shaped(3)

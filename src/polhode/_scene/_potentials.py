@@ -1,4 +1,4 @@
-"""Potentials: energy as a function of attitude and time; torques follow from the one H."""
+"""Potentials: energies as functions of attitude and time; torques follow from the Hamiltonian."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -57,8 +57,8 @@ class UniformGravity(AbstractPotential):
 
     **Arguments:** ``mass`` (...) [kg]; ``centre_body`` (..., 3) from the fixed point to the centre
     of mass [m], body axes; ``gravity_space`` (..., 3) [m/s^2], space axes. The inertia of the
-    scene is then the one about the fixed point. A centre of mass on body z: ``axial``, which holds
-    its ``distance`` (...) [m] in place of a ``centre_body``.
+    scene must be the one about the fixed point. For a centre of mass on body z use ``axial``, with
+    its ``distance`` (...) [m] in place of ``centre_body``.
 
     Raises ValueError for a negative mass, NaN, wrong shapes, or not exactly one of centre_body and
     distance.
@@ -111,7 +111,7 @@ class UniformGravity(AbstractPotential):
         return jnp.stack([zero, zero, self.distance], axis=-1)
 
     def height(self, row: Sequence[Array]) -> Array:
-        """Component (...) [m] of the centre along an axis of space, ``row`` of R in body axes."""
+        """Component (...) [m] of the centre along a space axis, whose ``row`` of R is given."""
         if self.distance is not None:
             return row[2] * self.distance
         return dot(row, components(self.centre))
@@ -123,10 +123,11 @@ class UniformGravity(AbstractPotential):
 
 
 class AlongZ(AbstractPotential):
-    """A uniform gravity or gradient in a frame whose z axis is along it: one row of R matters.
+    """Uniform gravity or a gravity gradient in a frame with its z axis along the field.
 
-    ``field``: the potential, of which the direction is not used; ``strength`` (...): the weight [N]
-    along z, or the distance [m] from the attracting centre, of either sign.
+    The energy then depends on one row of R only. ``field``: the potential, whose direction is not
+    used; ``strength`` (...): the weight [N] along z, or the distance [m] from the attracting
+    centre, of either sign.
     """
 
     field: "UniformGravity | GravityGradient" = shaped()
@@ -171,7 +172,7 @@ class GravityGradient(AbstractPotential):
 
 
 def _gradient_energy(mu, distance, direction, inertia: Inertia) -> Array:
-    """``direction``: components in the body of the unit vector to the centre, of either sign."""
+    """The energy; ``direction``: body components of the unit vector to the centre, either sign."""
     if inertia.is_principal:
         moments = components(inertia.moments)
         trace = moments[0] + moments[1] + moments[2]
@@ -181,7 +182,7 @@ def _gradient_energy(mu, distance, direction, inertia: Inertia) -> Array:
         trace = jnp.trace(tensor, axis1=-2, axis2=-1)
         rows = tuple(dot(components(tensor[..., i, :]), direction) for i in range(3))
         project = dot(direction, rows)
-    # factor by factor: the derivative of x / distance**3 holds distance**-6, subnormal in float32
+    # separate factors: the derivative of x / distance**3 has distance**-6, subnormal in float32
     inverse = 1 / distance
     return -mu / 2 * inverse * inverse * inverse * (trace - 3 * project)
 
@@ -192,9 +193,9 @@ _FUNCTION = Signature("Potential", {"R": (3, 3), "t": ()})
 class Potential(AbstractPotential):
     """Any potential of the attitude: ``fn(R, t)`` in joules, R (3, 3) body -> space, t in s.
 
-    ``fn`` sees one body; batches are mapped over it. Its torque comes from ``jax.grad`` of H. A
-    plain function is static data of the scene, not a leaf of it; an ``eqx.Module`` keeps its arrays
-    as leaves, shared by all bodies.
+    ``fn`` is called for one body; batches are mapped over it. Its torque follows by ``jax.grad`` of
+    H. A plain function is static data of the scene, not a leaf of it; the arrays of an
+    ``eqx.Module`` are leaves, shared by all bodies.
 
     Raises TypeError or ValueError for a function that takes or returns something else.
     """

@@ -1,4 +1,4 @@
-"""Scene and state: a body with what acts on it, how its motion starts; narrower constructors."""
+"""Scene (a body and its forces) and State (initial attitude and rates); narrower constructors."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -40,21 +40,21 @@ from polhode.inertia._inertia import VariableInertia, check_form, inertia_at
 
 
 class SciPyRotation(Protocol):
-    """What ``State`` needs of a ``scipy.spatial.transform.Rotation``."""
+    """The part of ``scipy.spatial.transform.Rotation`` that ``State`` uses."""
 
     def as_quat(self) -> np.ndarray: ...
 
 
 class State(AbstractPart):
-    """Attitude and body rates at one time, and the speeds of wheels where they are given.
+    """Attitude and body rates at one time, and optionally the speeds of wheels.
 
     **Arguments:** ``wxyz`` (..., 4): unit quaternion, scalar first, body -> space; one that is not
     of unit length is normalised; or a SciPy ``Rotation``. ``omega_body`` (..., 3): angular velocity
     in body axes [rad/s]. ``wheel_speed`` (..., m): speeds of the m wheels of the scene relative to
-    the body [rad/s], in the order of its rotors; they replace the speeds and momenta that the
-    ``ph.Rotor`` objects were given. None: those of the rotors. Entries of wheels with a prescribed
-    speed are not used (they may be NaN), nor is any entry in a scene without rotors. Leading axes
-    are a batch and broadcast together.
+    the body [rad/s], in the order of its rotors; they replace the speeds and momenta of the
+    ``ph.Rotor`` objects. None: those of the rotors. Entries of wheels with a prescribed speed are
+    not used (they may be NaN), nor is any entry in a scene without rotors. Leading axes are a batch
+    and broadcast together.
 
     Raises ValueError for a zero quaternion, NaN, wrong shapes or axes that do not broadcast.
     """
@@ -90,8 +90,8 @@ class State(AbstractPart):
     def of_samples(
         cls, wxyz: Array, omega_body: Array, wheel_speed: Array | None = None
     ) -> "State":
-        """Unit quaternions and rates that a simulation computed: unchecked, for they are NaN where
-        it failed."""
+        """A state from results of a simulation, without checks: they are NaN for bodies that
+        failed."""
         state = object.__new__(cls)
         values = {"wxyz": wxyz, "omega_body": omega_body, "wheel_speed": wheel_speed}
         for name, value in values.items():
@@ -112,7 +112,7 @@ class State(AbstractPart):
 
         ``phi, theta, psi`` (...); exactly one of ``rates`` (..., 3) = d(phi, theta, psi)/dt
         [rad/s] and ``momenta`` (..., 3) = (p_phi, p_theta, p_psi) [kg m^2/s], the latter with
-        ``inertia``. Momenta at theta = 0 or pi do not fix the rates: ValueError.
+        ``inertia``. ValueError for momenta at theta = 0 or pi, where they do not determine rates.
         """
         angles = tuple(
             as_float_array(name, value)
@@ -136,7 +136,7 @@ class State(AbstractPart):
             )
         momenta = as_float_array("momenta", momenta, (3,))
         if is_concrete(angles[1]):
-            theta = np.asarray(angles[1])  # pi is rounded, and its sine not zero
+            theta = np.asarray(angles[1])  # the sine of the rounded pi is not zero
             require(
                 np.abs(np.sin(theta)) > np.finfo(theta.dtype).eps * np.abs(theta),
                 "theta at 0 or pi: canonical momenta do not determine the body rates there;"
@@ -148,15 +148,15 @@ class State(AbstractPart):
 
     @property
     def without_wheels(self) -> "State":
-        """Attitude and body rates alone, once the scene holds the momenta of its wheels."""
+        """Attitude and body rates alone, for a scene that contains the momenta of its wheels."""
         if self.wheel_speed is None:
             return self
         return eqx.tree_at(lambda s: s.wheel_speed, self, None)
 
     def as_unit(self) -> "State":
-        """The state with quaternions of unit length, where an edit or a step left another."""
+        """The state with unit quaternions, which an edit or an optimiser may have changed."""
         square, wxyz = jnp.sum(self.wxyz**2, -1, keepdims=True), rotation.normalise(self.wxyz)
-        is_unit = jnp.abs(square - 1) <= 8 * jnp.finfo(wxyz.dtype).eps  # keeps its digits
+        is_unit = jnp.abs(square - 1) <= 8 * jnp.finfo(wxyz.dtype).eps  # then digits are unchanged
         wxyz = wxyz + jax.lax.stop_gradient(jnp.where(is_unit, self.wxyz - wxyz, 0))
         return eqx.tree_at(lambda s: s.wxyz, self, wxyz)
 
@@ -168,7 +168,7 @@ class State(AbstractPart):
 
 
 class Scene(Printable):
-    """A rigid body and what acts on it; absent parts are None and add nothing to the program.
+    """A rigid body with its potential, torque and rotors; those that are None are not compiled.
 
     **Arguments:** ``inertia``: ``ph.Inertia`` or ``ph.VariableInertia``; ``potential``:
     ``ph.AbstractPotential`` or None; ``torque``: ``ph.AbstractTorque`` or None; ``rotors``:
@@ -178,7 +178,7 @@ class Scene(Printable):
     Raises TypeError for a part of the wrong kind.
     """
 
-    if TYPE_CHECKING:  # of nearly all scenes, whose users should not have to ask
+    if TYPE_CHECKING:  # so that users of a constant inertia need no isinstance check
         inertia: Inertia
     else:
         inertia: Inertia | VariableInertia
@@ -219,7 +219,7 @@ class Scene(Printable):
         )
 
     def settled(self, state: State, start: Array) -> "Scene":
-        """The scene with the motion of its wheels fixed by the state at the time ``start``."""
+        """The scene with ``Wheels``, whose motion the state at the time ``start`` determines."""
         if self.rotors is None:
             return self
         wheels = self.rotors.settle(state.omega_body, start, state.wheel_speed)
@@ -230,8 +230,8 @@ class Scene(Printable):
     ) -> State:
         """The state with the body rates that give this momentum in body axes at the time ``t``.
 
-        ``momentum`` [kg m^2/s] includes that of the wheels, whose speeds are those of the state, or
-        those that the rotors were given.
+        ``momentum`` [kg m^2/s] includes that of the wheels, whose speeds are those of the state or
+        else of the rotors.
         """
         if self.rotors is None:
             rates = inertia_at(self.inertia, t).rates(momentum)
@@ -242,7 +242,7 @@ class Scene(Printable):
             turning = State(state.wxyz, omega, state.wheel_speed)
             return self.settled(turning, jnp.asarray(t, momentum.dtype)).momentum(omega, t)
 
-        # affine in the rates
+        # the momentum is an affine function of the rates
         at_rest = momentum_of(zero)
         columns = [momentum_of(zero + row) - at_rest for row in jnp.eye(3, dtype=momentum.dtype)]
         rates = jnp.linalg.solve(jnp.stack(columns, axis=-1), (momentum - at_rest)[..., None])
@@ -250,9 +250,9 @@ class Scene(Printable):
 
     @property
     def is_possible(self) -> Bool[Array, "*#b"]:
-        """Whether (...) a body can have this inertia and these wheels, also while traced.
+        """Whether (...) inertia and wheels are physical; works under JAX transformations.
 
-        An inertia that changes with time is not checked.
+        An inertia that varies with time is not checked.
         """
         if not isinstance(self.inertia, Inertia):
             return jnp.ones((), bool)
@@ -272,31 +272,31 @@ class Scene(Printable):
 
     @property
     def carrier(self) -> Inertia:
-        """The inertia that turns with the body: without wheels that are not held at their speed.
+        """The inertia without the axial moments of wheels whose speed is not prescribed.
 
-        Of an inertia that changes with time at t = 0; see ``carrier_at``.
+        If the inertia varies with time, at t = 0; see ``carrier_at``.
         """
         return self.carrier_at(0.0)
 
     def carrier_at(self, t: Array | float) -> Inertia:
-        """The inertia that turns with the body at the time ``t`` [s]."""
+        """``carrier`` at the time ``t`` [s]."""
         inertia = inertia_at(self.inertia, t)
         return inertia if self._wheels is None else self._wheels.carrier(inertia)
 
     def wheel_momentum(self, t: Array | float) -> Array | None:
-        """h(t) (..., 3) [kg m^2/s]: momentum L - (carrier) omega of the wheels; None without."""
+        """Wheel momentum h(t) = L - carrier omega (..., 3) [kg m^2/s]; None without wheels."""
         if self._wheels is None:
             return None
         return jnp.stack(jnp.broadcast_arrays(*self._wheels.body_momentum(t)), axis=-1)
 
     def momentum(self, omega: Array, t: Array | float) -> Array:
-        """Body momentum (..., 3) [kg m^2/s] of body rates (..., 3) [rad/s], wheels included."""
+        """Body momentum (..., 3) [kg m^2/s] for body rates (..., 3) [rad/s], wheels included."""
         momentum = self.carrier_at(t).momentum(omega)
         wheels = self.wheel_momentum(t)
         return momentum if wheels is None else jnp.add(*jnp.broadcast_arrays(momentum, wheels))
 
     def rates(self, momentum: Array, t: Array | float) -> Array:
-        """Body rates (..., 3) [rad/s] of body momenta (..., 3) [kg m^2/s], the inverse."""
+        """Body rates (..., 3) [rad/s] for body momenta (..., 3) [kg m^2/s], wheels included."""
         wheels = self.wheel_momentum(t)
         if wheels is not None:
             momentum = jnp.subtract(*jnp.broadcast_arrays(momentum, wheels))
@@ -305,8 +305,8 @@ class Scene(Printable):
     def acceleration(self, wxyz: Array | None, omega: Array, t: Array | float) -> Array:
         """Derivative (..., 3) of the body rates [rad/s^2] by the equations of motion.
 
-        ``wxyz`` (..., 4): attitude, None where nothing acts; ``omega`` (..., 3): body rates
-        [rad/s]; ``t``: time [s]. Leading axes of all broadcast, those of the parts included. Of
+        ``wxyz`` (..., 4): attitude, None if nothing depends on it; ``omega`` (..., 3): body rates
+        [rad/s]; ``t``: time [s]. All leading axes broadcast, including those of the parts. For
         coupled wheels see ``with_spins``.
         """
         return self.changes(wxyz, omega, t)[0]
@@ -314,7 +314,7 @@ class Scene(Printable):
     def changes(
         self, wxyz: Array | None, omega: Array, t: Array | float
     ) -> tuple[Array, tuple[Array, ...]]:
-        """The acceleration, and the torques (...) [N m] on the wheels that are coupled."""
+        """The acceleration, and the torques (...) [N m] on the coupled wheels."""
         t = jnp.asarray(t, omega.dtype)
         if wxyz is None:
             wxyz = jnp.zeros((*omega.shape[:-1], 4), omega.dtype).at[..., 0].set(1)
@@ -329,7 +329,7 @@ class Scene(Printable):
         def carried(t, spins):
             return self.with_spins(spins).wheel_momentum(t)
 
-        if self.rotors is not None:  # what the wheels take up does not turn the body
+        if self.rotors is not None:  # momentum that wheels take up does not accelerate the body
             _, wheel_momentum_rate = jax.jvp(carried, (t, spins), (jnp.ones_like(t), spin_rates))
             rate = rate - jnp.broadcast_to(wheel_momentum_rate, rate.shape)
         if isinstance(self.inertia, VariableInertia):  # I domega/dt = dL/dt - (dI/dt) omega
@@ -343,13 +343,13 @@ class Scene(Printable):
 
     @property
     def dynamics(self) -> Dynamics:
-        """The field of the equations of motion."""
+        """The vector field of the equations of motion."""
         wheels = self._wheels
         loose = None if wheels is None or wheels.is_constant else wheels
         return Dynamics(self.hamiltonian, self.torque, wheels=loose)
 
     def with_spins(self, spins: Sequence[Array] = ()) -> "Scene":
-        """The scene at a moment when its coupled wheels have these momenta [kg m^2/s]."""
+        """The scene at an instant when its coupled wheels have these momenta [kg m^2/s]."""
         wheels = self._wheels
         if wheels is None or not spins:
             return self
@@ -369,7 +369,7 @@ class Scene(Printable):
 
 
 class InverseOverTime(eqx.Module):
-    """Entries of the inverse of an inertia that changes, as a function of time."""
+    """Entries of the inverse of a variable inertia, as a function of time."""
 
     inertia: VariableInertia
     wheels: Wheels | None
@@ -380,8 +380,8 @@ class InverseOverTime(eqx.Module):
 
 
 def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
-    """Which leaves of the scene ``free`` points at, in its order: unlike a function, places tell a
-    compiled program whether it is the one asked for. TypeError or ValueError with the cure.
+    """Indices of the leaves of the scene that ``free`` returns, in its order. Unlike a function,
+    they can be compared, so that compiled programs are reused. TypeError or ValueError otherwise.
     """
     if not callable(free):
         raise TypeError(
@@ -433,7 +433,7 @@ def _check_kinds(scene: Scene) -> None:
 
 
 def check_scene(scene: Scene) -> None:
-    """TypeError or ValueError, naming the field, for a scene that an edit has left in disorder."""
+    """TypeError or ValueError, with the field, for a scene that an edit has made inconsistent."""
     _check_kinds(scene)
     for name in _KINDS:
         part = getattr(scene, name)
@@ -443,11 +443,11 @@ def check_scene(scene: Scene) -> None:
         _check_batch_axes(torque)
 
 
-_CHECKED: set[Any] = set()  # classes and shapes, for the check takes as long as a trace
+_CHECKED: set[Any] = set()  # classes and shapes checked before, since a check takes a trace
 
 
 def _check_batch_axes(torque: AbstractTorque) -> None:
-    """ValueError for batch axes of a class of the user's that its ``core_ranks`` leaves out."""
+    """ValueError for batch axes of a user's class that its ``core_ranks`` does not declare."""
     if type(torque).__module__.partition(".")[0] == "polhode":
         return
     arrays = {f.name: getattr(torque, f.name) for f in dataclasses.fields(torque)}
@@ -483,26 +483,26 @@ def specialise(scene: Scene) -> Scene:
     ``ph.Inertia.axisymmetric``, a diagonal tensor three moments; a centre of mass on body z
     becomes ``ph.UniformGravity.axial``; a wheel along a positive body axis ``ph.Rotor.axial``; an
     ellipse of eccentricity 0 a circle. The motion is the same, and ``ph.simulate`` may have a
-    closed-form solution for it. Numbers that the narrower parts do not hold have no derivative any
-    more: call it once, on a scene of concrete numbers. Of a batch all bodies must agree.
+    closed-form solution for it. Numbers absent from the narrower parts no longer have derivatives:
+    call it once, on a scene of concrete numbers. All bodies of a batch must allow a constructor.
 
         scene = ph.Scene(ph.Inertia([1.0, 1.0, 0.5]), ph.UniformGravity(1.0, [0.0, 0.0, 0.3]))
         ph.simulate(ph.specialise(scene), state, ts)       # Lagrange's top, not integrated
 
-    Raises TypeError for what is no ``ph.Scene``, ValueError while its numbers are traced.
+    Raises TypeError unless given a ``ph.Scene``, ValueError if its numbers are traced.
     """
     if not isinstance(scene, Scene):
         raise TypeError(f"specialise takes a ph.Scene, got {type(scene).__name__}.")
     if not is_concrete(scene):
         raise ValueError("specialise needs concrete numbers: call it outside of jit and grad.")
-    with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+    with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
         inertia, potential, rotors = map(narrower, (scene.inertia, scene.potential, scene.rotors))
         torque = jax.tree.map(narrower, scene.torque, is_leaf=lambda x: isinstance(x, KeplerOrbit))
     return Scene(inertia, potential, torque, rotors)
 
 
 def narrower(part: Any) -> Any:
-    """The same part by the narrowest constructor for its numbers."""
+    """The same part, built with the narrowest constructor for its numbers."""
     if isinstance(part, (PotentialSum, RotorSum)):
         return type(part)(tuple(narrower(term) for term in part.terms))
     for kind, rule in _RULES.items():
@@ -512,7 +512,7 @@ def narrower(part: Any) -> Any:
 
 
 def constructors(scene: Scene, special: Scene) -> list[str]:
-    """The names of the constructors by which ``special`` is narrower than ``scene``."""
+    """The names of the constructors of ``special`` that are narrower than those of ``scene``."""
     names = []
     if scene.inertia.symmetry is not special.inertia.symmetry:
         names.append(f"ph.Inertia.{special.inertia.symmetry.name.lower()}")

@@ -1,4 +1,4 @@
-"""Tables over time: what ephemerides, field models and atmospheres return, for any part."""
+"""Tables over time, such as from ephemerides, field models and atmospheres, for any part."""
 
 from typing import ClassVar
 
@@ -13,8 +13,8 @@ from polhode._kernels import smooth
 from polhode._parts import AbstractPart, shaped
 
 _NEIGHBOURS = 5
-"""Knots through which the polynomial runs whose derivative is taken: cubic interpolation is of
-fourth order, so the derivatives need no more than fourth order."""
+"""Number of knots of the polynomials from which derivatives at the times are estimated: cubic
+interpolation is of fourth order, so that fourth-order derivatives suffice."""
 
 
 class Table(AbstractPart):
@@ -23,19 +23,19 @@ class Table(AbstractPart):
     **Arguments:** ``times`` (n,) [s], ascending, shared by all bodies; ``values``: (..., n) of a
     number, (..., n, k) of a vector of k components, with leading axes for a batch; ``order``
     (static): 3 for cubic interpolation, whose error falls with the fourth power of the spacing, or
-    1 for linear interpolation. ``derivatives``: of the values [1/s], of their shape, for cubic
-    interpolation where they are known, such as the velocities of an ephemeris, their leading axes
-    broadcast with those of the values; None: those of the polynomials through five neighbouring
-    values. ``kind``: "number" or "vector", where the shape
-    of the values leaves both open.
+    1 for linear interpolation. ``derivatives``: time derivatives of the values, of their shape, for
+    cubic interpolation if they are known, such as the velocities of an ephemeris; their leading
+    axes broadcast with those of the values. None: those of the polynomials through five
+    neighbouring values. ``kind``: "number" or "vector", if the shape of the values is ambiguous.
 
     At the table times the first derivative of a linear table and the second derivative of a cubic
-    table jump. Steps of the integrator end there, so that ``rtol`` holds: a simulation takes at
-    least one step for each of the times within its span. Cubic tables are exempt that are so dense
-    (about 700 times in a period of their values) that the jumps are negligible.
+    table jump. Steps of the integrator end there to satisfy ``rtol``: a simulation takes at least
+    one step for each of the times within its span. Exempt are cubic tables so dense (about 700
+    times in a period of their values) that the jumps are negligible.
 
     ``table(t)`` is a number or a vector (k,) for each of the times ``t`` (...). Before the first
-    time and after the last one the outermost polynomials continue: cover the simulated span.
+    time and after the last one the outermost polynomials are extrapolated, so that a table should
+    cover the simulated span.
 
         sun = ph.Table([0.0, 3600.0, 7200.0], [[1.0, 0, 0], [0.9, 0.4, 0], [0.7, 0.7, 0]])
         sun(1800.0)
@@ -43,7 +43,7 @@ class Table(AbstractPart):
     Cubic Hermite interpolation: F. N. Fritsch and R. E. Carlson, SIAM J. Numer. Anal. 17 (1980)
     238, equation 2, without their limits on the derivatives.
 
-    Raises ValueError for times that do not ascend, fewer than two, other shapes, or another order.
+    Raises ValueError for times that do not increase, fewer than two, other shapes or orders.
     """
 
     smooth: ClassVar[bool] = False  # a derivative jumps at the times
@@ -78,7 +78,7 @@ class Table(AbstractPart):
                 f"Table times must be two or more, of shape (n,), got {self.times.shape}."
             )
         array = as_float_array("Table values", values)
-        self.times = self.times.astype(array.dtype)  # a list is of the default precision
+        self.times = self.times.astype(array.dtype)  # times from a list have the default precision
         if is_concrete(self.times):
             require(
                 np.diff(np.asarray(self.times)) > 0,
@@ -101,10 +101,10 @@ class Table(AbstractPart):
                 f"Table derivatives must have the shape of the values, {array.shape}, got"
                 f" {derivative_array.shape}."
             )
-        given = derivative_array[..., None] if self.is_number else derivative_array
-        lead = batch_of(values=(self.values, 2), derivatives=(given, 2))
+        columns = derivative_array[..., None] if self.is_number else derivative_array
+        lead = batch_of(values=(self.values, 2), derivatives=(columns, 2))
         self.values, self.derivatives = (
-            jnp.broadcast_to(x, (*lead, *x.shape[-2:])) for x in (self.values, given)
+            jnp.broadcast_to(x, (*lead, *x.shape[-2:])) for x in (self.values, columns)
         )
         self.has_kinks = _has_kinks(self.values, self.derivatives, knots)
 
@@ -125,12 +125,12 @@ class Table(AbstractPart):
 
 
 def check_kind(name: str, part: AbstractPart, count: int | None) -> None:
-    """Raise ValueError for a table that is not of vectors of ``count``, or of numbers if None."""
+    """ValueError for a table not of vectors of ``count`` components, or (None) not of numbers."""
     if not isinstance(part, Table):
         return
-    wanted = "numbers" if count is None else f"vectors of {count}"
-    found = "numbers" if part.is_number else f"vectors of {part.values.shape[-1]}"
-    require(found == wanted, f"{name} takes a Table of {wanted}, got one of {found}.")
+    expected = "numbers" if count is None else f"vectors of {count}"
+    kind = "numbers" if part.is_number else f"vectors of {part.values.shape[-1]}"
+    require(kind == expected, f"{name} takes a Table of {expected}, got one of {kind}.")
 
 
 def _is_number(shape: tuple[int, ...], n: int, kind: str | None) -> bool:
@@ -158,9 +158,9 @@ def _linear(table: Table, times: Array, t: Array, has_kinks: Array) -> Array:
 
 @smooth
 def _last_before(times: Array, t: Array) -> Array:
-    """Place of the last time that is not after ``t``, within [0, n - 2]."""
-    # ``jnp.searchsorted`` compares in the total order of floats, which no fused kernel can hold: a
-    # satellite in a field from a table took eleven times as long.
+    """Index of the last time that is not after ``t``, within [0, n - 2]."""
+    # Not by ``jnp.searchsorted``, which uses the total order of floats, an operation that fused
+    # kernels do not support: a satellite in a field from a table took eleven times as long.
     low, high = jnp.zeros_like(t, jnp.int32), jnp.full_like(t, times.size - 1, jnp.int32)
     for _ in range((times.size - 2).bit_length()):
         middle = (low + high) // 2
@@ -188,12 +188,12 @@ def _cubic(table: Table, times: Array, t: Array, has_kinks: Array) -> Array:
 
 
 def _interval(times: Array, t: Array, has_kinks: Array) -> Array:
-    """Place of the last time that is not after ``t``, within [0, n - 2].
+    """Index of the last time that is not after ``t``, within [0, n - 2].
 
-    The argument of ``floor`` is continuous and rises through whole numbers at the times, and
-    ``floor`` is the one switch that the integrator sees: held within a step, whatever the number of
-    times. Of a table without kinks it is constant, so that the switch never turns. Steps that
-    passed the times of 14 random values without ending there had errors of up to 444 rtol without a
+    ``floor`` is the only switch that the integrator detects, for any number of times: its argument
+    is continuous and passes integers at the times. The integrator keeps it constant within a step
+    and ends steps where it changes. For a table without kinks the argument is constant. Without
+    this, steps across the times of 14 random values had errors of up to 444 rtol, without a
     warning.
     """
     place = jnp.clip(jnp.floor(_place(times, t, has_kinks)), 0, times.size - 2)
@@ -202,24 +202,24 @@ def _interval(times: Array, t: Array, has_kinks: Array) -> Array:
 
 
 def _rows(values: Array, i: Array) -> Array:
-    """Rows ``i`` (...) of values (n, k), or (..., n, k) with leading axes that ``i`` has too."""
+    """Rows ``i`` (...) of values (n, k), or of (..., n, k) with the leading axes of ``i``."""
     if values.ndim == 2:
         return values[i]
     values = values.reshape((1,) * (i.ndim + 2 - values.ndim) + values.shape)
     return jnp.take_along_axis(values, i[..., None, None], axis=-2)[..., 0, :]
 
 
-@jax.jit  # one program, not one for each operation
+@jax.jit  # outside jit too, one program for all operations
 def _derivatives(values: Array, times: Array) -> Array:
-    """At each time, the derivative of the polynomial through the values around it."""
+    """At each time, the derivative of the polynomial through the neighbouring values."""
     n = times.size
     count = min(_NEIGHBOURS, n)
     place = np.arange(n)
     first_index = np.clip(place - count // 2, 0, n - count)
     total = jnp.zeros_like(values)
     for j in range(count):
-        # Lagrange's polynomial l_j, which is 1 at its own time: there its derivative is a sum, and
-        # at the other times a product without the factor that is zero
+        # Derivative of the Lagrange polynomial l_j, which is 1 at node j: a sum at node j itself,
+        # at the other nodes a product without the factor that is zero.
         is_node = first_index + j == place
         at = times[first_index + j]
         weight, product = jnp.zeros_like(times), jnp.ones_like(times)
@@ -237,12 +237,13 @@ def _derivatives(values: Array, times: Array) -> Array:
 
 
 _NEGLIGIBLE = 1e-9
-"""Jump of the second derivative, times the square of the spacing, over the largest value."""
+"""Negligible jump of the second derivative, times the square of the spacing, over the largest
+value."""
 
 
 @jax.jit
 def _has_kinks(values: Array, derivatives: Array, times: Array) -> Array:
-    """1 where second derivatives of cubic interpolation jump noticeably, else 0 (...)."""
+    """1 where second derivatives of the interpolation have jumps that matter, else 0 (...)."""
     width = jnp.diff(times).reshape((1,) * (values.ndim - 2) + (-1, 1))
     rise = jnp.diff(values, axis=-2) / width
     low, high = derivatives[..., :-1, :], derivatives[..., 1:, :]

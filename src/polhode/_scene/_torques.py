@@ -1,4 +1,4 @@
-"""Torques: in body and space axes, of the state, damping, pulses, and an energy sink."""
+"""Torques: in body and space axes, feedback, damping, pulses, and an energy sink."""
 
 import abc
 import dataclasses
@@ -39,26 +39,26 @@ class AbstractTorque(AbstractPart):
     def slip(
         self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
     ) -> Vector | None:
-        """Rates [rad/s] of the rotation in addition to I^-1 L in a body that loses energy inside.
+        """Rotation rates [rad/s] in addition to I^-1 L, due to dissipation inside the body.
 
-        None where there are none; see ``EnergySink``.
+        None for torques without; see ``EnergySink``.
         """
         return None
 
     def with_wheels(self, momentum: Sequence[Array]) -> "AbstractTorque":
-        """The torque at a moment when the wheels of the scene carry this momentum [kg m^2/s].
+        """The torque at an instant when the wheels of the scene have this momentum [kg m^2/s].
 
-        A torque that holds another one passes the momentum on to it.
+        A torque that contains another one passes the momentum on to it.
         """
         return self
 
     @property
     def edges(self) -> Array | None:
-        """Times (k,) [s] at which the torque jumps and steps have to end; None without such."""
+        """Times (k,) [s] at which the torque jumps and steps must end; None: none."""
         return None
 
     def during(self, t: Array | float) -> "AbstractTorque":
-        """What acts between the edges beside the time ``t``."""
+        """The torque between the two edges around the time ``t``."""
         return self
 
     def __add__(self, other: "AbstractTorque") -> "TorqueSum":
@@ -92,12 +92,12 @@ class TorqueSum(AbstractTorque, AbstractSum):
 
 
 def stacked(parts: Sequence[Array]) -> Array:
-    """An array (..., n) of its n components, broadcast together."""
+    """An array (..., n) from its n components, which broadcast together."""
     return jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
 
 
 def vector_of_time(name: str, n: Any) -> Array | Callable:
-    """A constant vector (..., 3), or a function fn(t) -> (3,) after a look at what it returns."""
+    """A constant vector (..., 3), or a function fn(t) -> (3,), checked by one call."""
     if not callable(n):
         return as_float_array(name, n, (3,))
     if isinstance(n, AbstractPart) and callable(n):
@@ -107,20 +107,20 @@ def vector_of_time(name: str, n: Any) -> Array | Callable:
 
 
 def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
-    """Components of such a vector; ``t`` may be an array of times: a function is mapped over it."""
+    """Components of a ``vector_of_time`` at ``t``; a function is mapped over an array of times."""
     if not callable(vector):
         return components(vector)
     if isinstance(vector, AbstractPart) and callable(vector):
-        return components(vector(t))  # carries the batch axes itself, such as KeplerOrbit
+        return components(vector(t))  # handles batch axes itself, such as KeplerOrbit
     return components(Signature(name, {"t": ()}, (3,)).mapped(vector, t))
 
 
 class BodyTorque(AbstractTorque):
     """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
-    The function may jump; for pulses at known times use ``ph.Pulses``, at whose edges steps end. A
-    plain function is static data of the scene, not a leaf; an ``eqx.Module`` has its arrays as
-    leaves.
+    The function may be discontinuous; for pulses at known times use ``ph.Pulses``, at whose edges
+    steps end. A plain function is static data of the scene, not a leaf; the arrays of an
+    ``eqx.Module`` are leaves.
 
     Raises TypeError or ValueError for a function that takes or returns something else.
     """
@@ -154,7 +154,7 @@ class SpaceTorque(AbstractTorque):
 
 
 def coefficients(name: str, c, hint: str = "a positive c takes energy away") -> Array:
-    """Damping about three axes, from one number or three; ``name``: of the argument."""
+    """Coefficients (..., 3) from one number or three; ``name``: of the argument."""
     c = as_float_array(name, c)
     if c.ndim == 0:
         c = jnp.broadcast_to(c, (3,))
@@ -195,7 +195,8 @@ class QuadraticDamping(AbstractTorque):
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
         square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
-        turning = square > 0  # the slope of the root is infinite at rest, that of the torque is 0
+        # at rest the derivative of the root is infinite, but that of the torque is zero
+        turning = square > 0
         size = jnp.where(turning, jnp.sqrt(jnp.where(turning, square, 1)), 0)
         return triple(-c * size * rate for c, rate in zip(components(self.c), omega))
 
@@ -206,8 +207,8 @@ _FEEDBACK = Signature("FeedbackTorque", {"t": (), "wxyz": (4,), "omega_body": (3
 class FeedbackTorque(AbstractTorque):
     """Torque as a function of time and state: ``fn(t, wxyz, omega_body)`` in body axes [N m].
 
-    ``fn`` sees one body: t [s], unit quaternion (4,) body -> space (of either sign), body rates
-    (3,) [rad/s], and returns (3,); batches are mapped over it. Arrays that ``fn`` carries (an
+    ``fn`` is called for one body: t [s], unit quaternion (4,) body -> space (of either sign), body
+    rates (3,) [rad/s], and returns (3,); batches are mapped over it. Arrays of ``fn`` (an
     ``eqx.Module``) are leaves of the scene, shared by all bodies; a plain function is static.
 
     Raises TypeError or ValueError for a function that takes or returns something else.
@@ -227,21 +228,21 @@ class FeedbackTorque(AbstractTorque):
 
 # Dissipation inside a body that conserves its angular momentum: the energy sink.
 #
-# No torque acts from outside, so that R L does not change. The parts of the body that yield a
-# little turn its mean axes on by a slip s beside the rates omega = I^-1 L,
+# No external torque acts, so that R L is constant. Deformations of the body add a slip s to the
+# rates omega = I^-1 L of its mean axes,
 #
-#     dR/dt = R [omega + s]x,   dL/dt = L x (omega + s),   s = k (L x omega),
+#     dR/dt = R [omega + s]x,   dL/dt = L x (omega + s),   s = k (L x omega).
 #
-# whatever s may be: d(R L)/dt = R ((omega + s) x L + L x (omega + s)) = 0. The kinetic energy
-# T = L . omega / 2 falls by
+# R L is constant for any s: d(R L)/dt = R ((omega + s) x L + L x (omega + s)) = 0. The kinetic
+# energy T = L . omega / 2 changes by
 #
-#     dT/dt = omega . (L x s) = -k |L x omega|^2,
+#     dT/dt = omega . (L x s) = -k |L x omega|^2.
 #
-# that is wherever the body does not turn about a principal axis, down to |L|^2 / (2 I_max), the
-# only stable end. This is the double bracket of A. M. Bloch, P. S. Krishnaprasad, J. E. Marsden, T.
-# S. Ratiu, The Euler-Poincare equations and double bracket dissipation, Commun. Math. Phys. 175
-# (1996) 1, with the attitude that belongs to it; as an energy sink: P. W. Likins, Effects of energy
-# dissipation on the free body motions of spacecraft, JPL TR 32-860 (1966).
+# It decreases unless the body rotates about a principal axis, to |L|^2 / (2 I_max), the only stable
+# equilibrium. This is the double bracket of A. M. Bloch, P. S. Krishnaprasad, J. E. Marsden, T. S.
+# Ratiu, The Euler-Poincare equations and double bracket dissipation, Commun. Math. Phys. 175 (1996)
+# 1, with the corresponding attitude; as an energy sink: P. W. Likins, Effects of energy dissipation
+# on the free body motions of spacecraft, JPL TR 32-860 (1966).
 
 
 _RATE_LAW = Signature("EnergySink", {"momentum_body": (3,), "omega_body": (3,)})
@@ -250,17 +251,17 @@ _RATE_LAW = Signature("EnergySink", {"momentum_body": (3,), "omega_body": (3,)})
 class EnergySink(AbstractTorque):
     """Loss of kinetic energy inside the body at constant angular momentum in space.
 
-    dT/dt = -k |L x omega|^2 [W], and no torque from outside: the body ends in a spin about its
-    axis of largest moment. ``k`` (...) [s/(kg m^2)] is a rate law: a number, not negative, or a
-    function ``fn(momentum_body, omega_body)`` of L (3,) [kg m^2/s] and omega (3,) [rad/s] of one
-    body that returns one, stored and checked as those of ``BodyTorque``. A body of moments A, A, C
-    with its angular momentum at the angle theta from the axis of C obeys, while k is constant,
+    dT/dt = -k |L x omega|^2 [W], without an external torque: the body ends in a rotation about its
+    axis of largest moment. ``k`` (...) [s/(kg m^2)]: a number, not negative, or a function
+    ``fn(momentum_body, omega_body)`` of L (3,) [kg m^2/s] and omega (3,) [rad/s] of one body that
+    returns a number, stored and checked as those of ``BodyTorque``. With moments A, A, C and a
+    constant k, the angle theta between the angular momentum and the axis of C obeys
 
         tan theta(t) = tan theta(0) exp(k |L|^2 (1/C - 1/A) t).
 
-    ``omega_body`` of a trajectory is I^-1 L. The body rotates in addition by ``slip``, which is
-    small where little energy is lost in a revolution; ``docs/how-to/dissipate_energy.md`` derives
-    this and gives rate laws. Other torques and potentials may act as well, if they are small
+    ``omega_body`` of a trajectory is I^-1 L. The actual rates include ``slip`` as well, which is
+    small if little energy is lost in a revolution; ``docs/how-to/dissipate_energy.md`` derives
+    this and gives functions for k. Other torques and potentials may act as well, if they are small
     compared with |L x omega|.
 
         sink = ph.EnergySink(0.01)
@@ -283,7 +284,7 @@ class EnergySink(AbstractTorque):
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
-        return triple([jnp.zeros_like(omega[0])] * 3)  # nothing acts from outside
+        return triple([jnp.zeros_like(omega[0])] * 3)  # no external torque
 
     def slip(self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]) -> Vector:
         rate = self.k
@@ -296,17 +297,18 @@ _COMMAND = dataclasses.replace(_FEEDBACK, name="SampledTorque")
 
 
 class SampledTorque(AbstractTorque):
-    """A controller that runs once in every period; its torque is held in between.
+    """A sampled controller: its torque is computed once per period and constant in between.
 
-    The zero-order hold of flight software. **Arguments:** ``fn(t, wxyz, omega_body)`` -> (3,):
-    torque in body axes [N m], as of ``ph.FeedbackTorque``; ``period`` [s]: a number, not a leaf.
-    ``fn`` is called at the first time of a simulation and in every ``period`` after it, so that a
-    simulation that continues another one should start where a period ends. It need not be smooth.
+    It models the zero-order hold of flight software. **Arguments:** ``fn(t, wxyz, omega_body)`` ->
+    (3,): torque in body axes [N m], as for ``ph.FeedbackTorque``; ``period`` [s]: a number, not a
+    leaf. ``fn`` is called at the first time of a simulation and after every ``period``, so that a
+    simulation that continues another one should start at the end of a period. ``fn`` need not be
+    smooth.
 
     Only ``ph.simulate`` integrates it, alone or as a term of a sum, without events and work; the
-    times must be known (under ``jax.jit`` a list or a NumPy array), and ``Trajectory.at`` is not
-    available. A motion takes one integration for every period and every time. Derivatives by the
-    state and by the arrays of ``fn`` are those of the sampled system.
+    times must be concrete (under ``jax.jit`` a list or a NumPy array), and ``Trajectory.at`` is not
+    available. A simulation needs one integration for every period and every saved time. Derivatives
+    with respect to the state and the arrays of ``fn`` are those of the sampled system.
 
         law = ph.SampledTorque(lambda t, wxyz, omega: -0.5 * omega, period=0.1)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=law)
@@ -330,7 +332,7 @@ class SampledTorque(AbstractTorque):
         self.period = float(period)
 
     def command(self, t: Array, wxyz: Array, omega: Array) -> Array:
-        """The torque (N, 3) [N m] that N bodies will hold from the time ``t`` on."""
+        """The torque (N, 3) [N m] of N bodies from the time ``t`` to the end of the period."""
         return _COMMAND.mapped(self.fn, t, wxyz, omega)
 
     def body_components(
@@ -344,7 +346,7 @@ class SampledTorque(AbstractTorque):
         )
 
 
-# Pulses: torques that act for a while, such as those of thrusters, whose edges no step misses.
+# Pulses: torques that act between given times, such as those of thrusters; steps end at the edges.
 
 
 class Pulses(AbstractTorque):
@@ -352,8 +354,9 @@ class Pulses(AbstractTorque):
 
     **Arguments:** ``torque``: the torque during the pulses, such as ``ph.BodyTorque``; ``starts``,
     ``ends`` (k,) [s]: shared by all bodies, each end after its start. Steps end at every edge, so
-    that no pulse is missed however short, and derivatives with respect to starts and ends are
-    exact. Pulses that overlap act once. A motion with k pulses is solved in 2 k + 1 parts.
+    that even very short pulses are integrated, and derivatives with respect to starts and ends are
+    exact. The torque of overlapping pulses is not added. A motion with k pulses is solved in
+    2 k + 1 parts.
 
         burn = ph.Pulses(ph.BodyTorque([0.0, 0.0, 2.0]), [1.0, 5.0], [1.05, 5.001])
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=burn)

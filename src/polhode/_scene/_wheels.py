@@ -1,13 +1,13 @@
 """Rotors (wheels) whose axes are fixed in the body: gyrostats.
 
-The inertia of the scene is that of the whole body with its wheels locked, their moments about
-their own axes included (Basilisk's hub inertia has the same meaning there; some texts leave the
-wheels out). A wheel of moment J about the unit axis a, at the speed Omega relative to the body,
-adds J Omega a to L = I omega. Held at that speed: L = I omega + J Omega a. Turned by a motor of
-torque tau about its axis (0: it spins freely) its momentum c = J (a . omega + Omega) obeys
-dc/dt = tau, and L = (I - J a a^T) omega + c a: in both cases the one Hamiltonian with a momentum
-h(t) subtracted from L (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4, 6). Where tau
-depends on the state (a coupling: friction, a motor with its limits), c is part of the state.
+The inertia of the scene is that of the whole body with its wheels locked, including their moments
+about their own axes (as Basilisk's hub inertia; some texts exclude the wheels). A wheel of moment J
+about the unit axis a, at the speed Omega relative to the body, adds J Omega a to L = I omega. If
+that speed is prescribed, L = I omega + J Omega a. If a motor exerts the torque tau about its axis
+(0: it spins freely), its momentum c = J (a . omega + Omega) obeys dc/dt = tau, and
+L = (I - J a a^T) omega + c a. In both cases the Hamiltonian is the same function of L - h(t), with
+a wheel momentum h(t) (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4, 6). If tau depends
+on the state (a coupling: friction, a motor with its limits), c is part of the state.
 """
 
 import abc
@@ -36,12 +36,13 @@ from polhode._hamiltonian import Attitude, Vector, dot, triple
 from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
 from polhode.inertia import Inertia, Symmetry
 
-# What acts between a wheel and the body about the wheel's axis: motors, friction, dampers. The
-# wheel takes the torque, the body its reaction; the wheel's momentum is then part of the state.
+# Couplings between a wheel and the body about the wheel's axis: motors, friction, dampers. The
+# torque acts on the wheel, its reaction on the body; the wheel's momentum is then part of the
+# state.
 
 
 class AbstractCoupling(AbstractPart):
-    """Base of what acts between a wheel and its body; couplings add with ``+``.
+    """Base of couplings between a wheel and its body; couplings add with ``+``.
 
     ``torque(t, speed, attitude, omega)`` returns the torque [N m] on the wheel about its axis;
     ``speed``: that of the wheel relative to the body [rad/s].
@@ -61,7 +62,7 @@ class AbstractCoupling(AbstractPart):
         attitude: Attitude,
         omega: Sequence[Array],
     ) -> Array:
-        """The same on wheel ``i``, where the speeds of all wheels are at hand."""
+        """``torque`` on wheel ``i``, for couplings that depend on the speeds of all wheels."""
         return self.torque(t, speed_of(i), attitude, omega)
 
     def __add__(self, other: "AbstractCoupling") -> "CouplingSum":
@@ -84,7 +85,7 @@ class CouplingSum(AbstractCoupling, AbstractSum):
 
 
 class Couplings(AbstractSum):
-    """Those of several wheels, one each."""
+    """The couplings of several wheels, one for each."""
 
     terms: tuple[AbstractCoupling, ...]
 
@@ -120,9 +121,9 @@ class ViscousCoupling(AbstractCoupling):
 class CoulombFriction(AbstractCoupling):
     """Dry friction of a bearing, smoothed: -torque tanh(Omega / speed) on the wheel.
 
-    ``torque`` (...) [N m] and ``speed`` (...) [rad/s] below which it falls to zero, both not
-    negative, the speed positive. The step of dry friction itself has no solution that an explicit
-    integrator can follow at rest; here a wheel creeps to rest as if viscous, with torque / speed.
+    ``torque`` (...) [N m], not negative; ``speed`` (...) [rad/s], positive: below it the torque
+    falls to zero. Without smoothing the torque jumps at rest, which an explicit integrator cannot
+    resolve; here a wheel comes to rest as with viscous friction of coefficient torque / speed.
     Raises ValueError for other numbers.
     """
 
@@ -150,7 +151,7 @@ class AbstractRotor(AbstractPart):
     @property
     @abc.abstractmethod
     def wheels(self) -> tuple[Any, ...]:
-        """One by one."""
+        """The single wheels."""
 
     def __add__(self, other: "AbstractRotor") -> "RotorSum":
         if not isinstance(other, AbstractRotor):
@@ -158,11 +159,11 @@ class AbstractRotor(AbstractPart):
         return RotorSum((*self.wheels, *other.wheels))
 
     def check_within(self, inertia: Inertia) -> None:
-        """ValueError for a wheel whose moment is not part of the body's about its axis."""
+        """ValueError for a wheel whose moment is not below that of the body about its axis."""
         for wheel in self.wheels:
             if wheel.inertia is None:
                 continue
-            with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+            with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
                 about = _moment_about(inertia, wheel.direction)
             require(
                 np.asarray(wheel.inertia) < about,
@@ -174,9 +175,10 @@ class AbstractRotor(AbstractPart):
     def settle(
         self, omega_body: Float[Array, "*#b 3"], start: Array, wheel_speed: Array | None = None
     ) -> "Wheels":
-        """The wheels of bodies with rates ``omega_body`` at the time ``start`` (...).
+        """The ``Wheels`` of bodies with rates ``omega_body`` at the time ``start`` (...).
 
-        ``wheel_speed`` (..., m) [rad/s]: relative to the body; None: what the rotors were given.
+        ``wheel_speed`` (..., m) [rad/s]: relative to the body; None: speeds or momenta of the
+        rotors.
         """
         speeds = _speeds_of(wheel_speed, len(self.wheels))
         columns = [
@@ -215,7 +217,7 @@ class RotorSum(AbstractRotor, AbstractSum):
 
 
 def _speeds_of(wheel_speed: Array | None, count: int) -> Sequence[Array | None]:
-    """The speed (...) of each of ``count`` wheels, None where it is not given."""
+    """The speed (...) of each of ``count`` wheels; all None if ``wheel_speed`` is None."""
     if wheel_speed is None:
         return [None] * count
     if wheel_speed.shape[-1] != count:
@@ -227,12 +229,12 @@ def _speeds_of(wheel_speed: Array | None, count: int) -> Sequence[Array | None]:
 
 
 class Wheels(AbstractRotor):
-    """Rotors whose motion is known: what ``Rotor`` becomes once the state of the body is.
+    """Rotors with initial momenta, which the initial state of the body determines.
 
     ``axes`` (..., m, 3); ``momentum`` (..., m) at the time ``start`` (...), relative to the body
-    where ``is_held``, else absolute; ``inertia`` (..., m), 0 where not known; ``torque`` (..., m).
-    ``coupled`` (static): the wheels whose momenta are part of the state, the initial ones standing
-    in ``momentum``; ``spins``: their momenta of the moment, see ``at``.
+    for a wheel of prescribed speed (``is_held``), else absolute; ``inertia`` (..., m), 0 where not
+    known; ``torque`` (..., m). ``coupled`` (static): indices of the wheels whose momenta are part
+    of the state, with initial values in ``momentum``; ``spins``: their current momenta, see ``at``.
     """
 
     impulses: tuple[Callable | None, ...]
@@ -255,21 +257,21 @@ class Wheels(AbstractRotor):
         )
 
     def check_within(self, inertia):
-        """Nothing: the rotors were checked before they were settled."""
+        """No check: the ``Rotor`` objects were checked before."""
 
     @property
     def is_possible(self) -> Array:
-        """Whether (...) each wheel that is not held has a positive moment."""
+        """Whether (...) each wheel without a prescribed speed has a positive moment."""
         return jnp.all(self.inertia[..., np.array(self.loose, int)] > 0, axis=-1)
 
     @property
     def is_constant(self) -> bool:
-        """Whether every wheel is held (static); the momentum may be constant all the same."""
+        """Whether every wheel has a prescribed speed, so that h is constant (static)."""
         return all(self.is_held)
 
     @property
     def loose(self) -> tuple[int, ...]:
-        """Which wheels are not held (static)."""
+        """Indices of the wheels without a prescribed speed (static)."""
         return tuple(i for i, is_held in enumerate(self.is_held) if not is_held)
 
     def settle(self, omega_body, start, wheel_speed=None):
@@ -285,11 +287,11 @@ class Wheels(AbstractRotor):
         return dataclasses.replace(self, momentum=momentum, start=start)
 
     def at(self, spins: Sequence[Array]) -> "Wheels":
-        """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""
+        """The wheels at an instant when the coupled ones have these momenta [kg m^2/s]."""
         return dataclasses.replace(self, spins=tuple(spins))
 
     def with_spins_at_start(self, spins: Array) -> "Wheels":
-        """The wheels with these initial momenta (..., k) of those that are coupled."""
+        """The wheels with these initial momenta (..., k) of the coupled ones."""
         shape = jnp.broadcast_shapes(spins.shape[:-1], self.momentum.shape[:-1])
         momentum = jnp.broadcast_to(self.momentum, (*shape, self.momentum.shape[-1]))
         places = np.array(self.coupled, int)
@@ -311,7 +313,7 @@ class Wheels(AbstractRotor):
     def motor_torques(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> list[Array]:
-        """Torque [N m] on each wheel about its axis from the body; zero where it is held."""
+        """Torque [N m] of the body on each wheel about its axis; zero for a prescribed speed."""
         torques, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
         for i, is_held in enumerate(self.is_held):
             if i in self.coupled:
@@ -328,7 +330,7 @@ class Wheels(AbstractRotor):
     def motor_power(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> list[Array]:
-        """Power [W] that motor and friction of each wheel give to the motion; zero where held."""
+        """Power [W] of motor and friction of each wheel; zero for a prescribed speed."""
         torques = self.motor_torques(t, attitude, omega)
         return [
             torque if is_held else torque * self.speed(i, t, omega)
@@ -351,7 +353,7 @@ class Wheels(AbstractRotor):
         return momentum + (impulse_at(t) - impulse_at(self.start))
 
     def body_momentum(self, t: Array | float) -> Vector:
-        """h(t): what L is more than the momentum of the body [kg m^2/s], body components."""
+        """h(t) = L - carrier omega [kg m^2/s], body components; see ``carrier``."""
         parts = [
             tuple(self.axial_momentum(i, t) * self.axes[..., i, k] for k in range(3))
             for i in range(len(self.is_held))
@@ -359,12 +361,12 @@ class Wheels(AbstractRotor):
         return triple(sum(column[1:], start=column[0]) for column in zip(*parts))
 
     def energy(self, t: Array | float) -> Array | None:
-        """c^2/(2J) of the wheels that are not held [J]; None without such."""
+        """Sum of c^2/(2J) [J] over the wheels without a prescribed speed; None without such."""
         parts = [self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i]) for i in self.loose]
         return sum(parts[1:], start=parts[0]) if parts else None
 
     def carrier(self, inertia: Inertia) -> Inertia:
-        """The inertia that turns with the body: less that of wheels free about their axes."""
+        """The inertia minus the axial moments J a a^T of the wheels without a prescribed speed."""
         loose = self.loose
         if not loose:
             return inertia
@@ -390,7 +392,7 @@ class Wheels(AbstractRotor):
         return Inertia(full=tensor)
 
 
-# One wheel, as the user describes it.
+# A single wheel, the class for users.
 
 
 class Rotor(AbstractRotor):
@@ -398,20 +400,21 @@ class Rotor(AbstractRotor):
 
     **Arguments:**
 
-    - ``axis_body`` (..., 3): its axis in body axes (normalised). A wheel on body x, y or z:
+    - ``axis_body`` (..., 3): its axis in body axes (normalised). For a wheel on body x, y or z use
       ``Rotor.axial``.
-    - ``inertia`` (...): its moment J about that axis [kg m^2]; already part of the body's inertia.
-      May be left out when ``momentum`` is given and no ``torque``, ``impulse`` or ``coupling``.
+    - ``inertia`` (...): its moment J about that axis [kg m^2], which the body's inertia includes.
+      Optional with ``momentum`` and without ``torque``, ``impulse`` and ``coupling``.
     - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
       both relative to the body, at the first time. A state with a ``wheel_speed`` replaces them,
       except for a prescribed speed.
     - ``torque`` (...) [N m]: torque of the motor on the wheel about its axis, with the reaction on
-      the body; 0: the wheel spins freely. None: the speed is prescribed.
+      the body; 0: the wheel spins freely. None (and no ``impulse`` or ``coupling``): the speed is
+      prescribed.
     - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
       function of time [s] returning N m s.
-    - ``coupling``: instead of both, what acts between wheel and body by the wheel's speed, the time
-      and the state: ``ph.ViscousCoupling`` or a sum of such. Closed-form methods do not accept such
-      wheels.
+    - ``coupling``: instead of both, a torque between wheel and body that depends on the wheel's
+      speed, time and state: ``ph.ViscousCoupling`` or a sum of couplings. Closed-form methods do
+      not accept such wheels.
 
     Raises ValueError for a zero axis, J <= 0, or more or less than one of momentum and speed.
     """
@@ -504,9 +507,8 @@ class Rotor(AbstractRotor):
     ) -> "Rotor":
         """A wheel on a body axis: ``axis`` 0, 1 or 2 for body x, y or z.
 
-        The other arguments are those of ``Rotor``. A symmetric body with wheels on body z that are
-        held at their speed has closed-form solutions, and with wheels on its axes it keeps them as
-        principal axes.
+        The other arguments are those of ``Rotor``. A symmetric body with wheels of prescribed speed
+        on body z has closed-form solutions. Wheels on principal axes leave these principal axes.
         """
         return cls(None, inertia, momentum, speed, torque, impulse, coupling, axis=axis)
 
@@ -531,9 +533,9 @@ class Rotor(AbstractRotor):
     def column(
         self, omega_body: Array, start: Array, wheel_speed: Array | None = None
     ) -> tuple[Array, Array, Array, Array]:
-        """Axis, its momentum at the start (relative if held, else absolute), J, motor torque.
+        """Axis, initial momentum (relative if ``is_held``, else absolute), J, motor torque.
 
-        ``wheel_speed`` (...) [rad/s]: at the start, of a wheel that is not held; None: its own.
+        ``wheel_speed`` (...) [rad/s]: initial speed if not ``is_held``; None: that of the rotor.
         """
         direction = self.direction
         parts = (self.inertia, self.momentum, self.speed, self.torque)
@@ -556,7 +558,7 @@ class Rotor(AbstractRotor):
 
 
 def _moment_about(inertia: Inertia, axis: Array | np.ndarray) -> np.ndarray | np.floating:
-    """The body's moment of inertia (...) about unit axes (..., 3); all numbers are known."""
+    """The body's moment of inertia (...) about unit axes (..., 3); for concrete numbers."""
     unit = np.asarray(axis)
     if inertia.full is None:
         return np.sum(np.asarray(inertia.moments) * unit**2, axis=-1)
@@ -565,10 +567,10 @@ def _moment_about(inertia: Inertia, axis: Array | np.ndarray) -> np.ndarray | np
 
 def _unit(axis: Array | np.ndarray) -> Array:
     values = on_host(axis)
-    if isinstance(values, np.ndarray):  # without compiling a program
+    if isinstance(values, np.ndarray):  # by NumPy, without compilation
         values = values / np.max(np.abs(values), axis=-1, keepdims=True)
         length = np.sqrt(np.sum(values**2, axis=-1, keepdims=True))
         return as_float_array("axis_body", values / length, finite=False)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
-    scaled = jnp.asarray(axis) / largest  # of any size: nothing overflows
+    scaled = jnp.asarray(axis) / largest  # so that nothing overflows
     return scaled / jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""The result of a simulation: samples, what follows from them, and the way to other times."""
+"""The result of a simulation: samples, quantities derived from them, and states at other times."""
 
 from polhode._trajectory._propagator import (
     Propagator as Propagator,

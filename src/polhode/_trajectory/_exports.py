@@ -1,4 +1,4 @@
-"""Trajectories for others: xarray, and attitude ephemeris messages of the CCSDS."""
+"""Export of trajectories: SciPy, xarray, and CCSDS attitude ephemeris messages."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def scipy_rotation(wxyz: Any) -> "Rotation":
-    """Attitudes as a SciPy ``Rotation``, which takes no NaN."""
+    """Attitudes as a SciPy ``Rotation``; ValueError for NaN, which SciPy rejects."""
     missing = int(np.sum(np.isnan(np.asarray(wxyz)[..., 0])))
     require(
         missing == 0,
@@ -72,7 +72,7 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     for path, values in jax.tree_util.tree_leaves_with_path(trajectory._saved):
         key = jax.tree_util.keystr(path, simple=True, separator="_")
         name = f"saved_{key}" if key else "saved"
-        while name in data:  # of {"a_b": x, "a": {"b": y}}
+        while name in data:  # equal names, such as of {"a_b": x, "a": {"b": y}}
             name += "_"
         axes = (f"{name}_{k}" for k in range(values.ndim - len(sample_dims)))
         source = {"long_name": "value of the function of ph.Record(save=...)"}
@@ -149,7 +149,7 @@ def write_aem(
     rates: bool = True,
     creation_date: str | None = None,
 ) -> None:
-    """See ``Trajectory.to_aem``. Sections 4.2 to 4.4 and annex B of the standard."""
+    """See ``Trajectory.to_aem``. CCSDS 504.0-B-2, sections 4.2 to 4.4 and annex B."""
     start = _instant("epoch", epoch)
     current_time = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
     created = current_time if creation_date is None else creation_date
@@ -171,7 +171,7 @@ def write_aem(
     lines = ["CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {created}", f"ORIGINATOR = {originator}"]
     for k in range(count):
         t = ts.reshape(count, samples)[k]
-        places = np.unique(t, return_index=True)[1]  # in the order of time, each time once
+        places = np.unique(t, return_index=True)[1]  # by increasing time, without repeated times
         moments = [_later(start, x) for x in t[places]]
         if len(set(moments)) < len(moments):
             raise ValueError(
@@ -202,10 +202,10 @@ def write_aem(
 
 
 def _rows(wxyz: np.ndarray, omega: np.ndarray) -> Iterator[str]:
-    """Q1 Q2 Q3 QC, of A2B: components in space to components in the body; rates in deg/s."""
+    """Rows Q1 Q2 Q3 QC of the transformation A to B (space to body components), rates in deg/s."""
     if not (np.isfinite(wxyz).all() and np.isfinite(omega).all()):
         raise ValueError(
-            "the samples hold NaN: write the bodies that arrived, traj[traj.successful]."
+            "the samples contain NaN: write only the bodies that finished, traj[traj.successful]."
         )
     xyzw = wxyz[:, [1, 2, 3, 0]]
     for row in np.concatenate([xyzw, np.rad2deg(omega)], axis=-1):
@@ -213,8 +213,8 @@ def _rows(wxyz: np.ndarray, omega: np.ndarray) -> Iterator[str]:
 
 
 def _instant(name: str, value: Any) -> tuple[np.datetime64, int]:
-    """A calendar time as whole seconds and nanoseconds: ``datetime64`` in nanoseconds holds the
-    years 1678 to 2262 only, and wraps."""
+    """A calendar time as whole seconds and nanoseconds, because ``datetime64`` in nanoseconds
+    overflows silently outside the years 1678 to 2262."""
     pattern = r"(\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2})(?:\.(\d{1,9}))?Z?"
     parts = re.fullmatch(pattern, value) if isinstance(value, str) else None
     if parts is None:
@@ -228,7 +228,7 @@ def _instant(name: str, value: Any) -> tuple[np.datetime64, int]:
 
 
 def _later(start: tuple[np.datetime64, int], seconds: float) -> str:
-    """The calendar time so many seconds after another."""
+    """The calendar time ``seconds`` after ``start``."""
     whole, rest = divmod(start[1] + round(float(seconds) * 1e9), 10**9)
     years = abs(whole) / 31_556_952
     text = "" if years > 10_000 else str(start[0] + np.timedelta64(whole, "s"))
@@ -248,7 +248,7 @@ def _one_per_body(name: str, value: Any, count: int) -> list[str]:
 
 
 def _text(name: str, value: Any) -> str:
-    """One line of printable ASCII, as the standard wants values."""
+    """The value; TypeError or ValueError unless it is one line of printable ASCII (standard)."""
     if not isinstance(value, str) or not re.fullmatch(r"[!-~]([ -~]*[!-~])?", value):
         raise ValueError(f"{name} must be one line of printable ASCII, got {value!r:.60}.")
     return value

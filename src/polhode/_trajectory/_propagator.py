@@ -1,4 +1,4 @@
-"""Trajectories between their samples: the method that made them, run once more."""
+"""Trajectories at other times than their samples, by running the method of the simulation again."""
 
 from collections.abc import Callable
 from typing import Any
@@ -20,10 +20,10 @@ from polhode.rotation._quaternion import wxyz_rate
 
 
 class Propagator(AbstractPropagator):
-    """The method that moved a trajectory, and its tolerance (None for exact methods).
+    """The method that computed a trajectory, and its tolerance (None for exact methods).
 
-    Arrays of the method are leaves, all else of it is static: trajectories pass through ``jax.jit``
-    and ``jax.vmap`` as results.
+    Arrays of the method are leaves and the rest of it is static, so that ``jax.jit`` and
+    ``jax.vmap`` can return trajectories.
     """
 
     arrays: Any
@@ -32,7 +32,7 @@ class Propagator(AbstractPropagator):
 
     @classmethod
     def of(cls, method: AbstractMethod, rtol: Any) -> "Propagator":
-        """Of what a trajectory was made with."""
+        """From the method and the tolerance of a simulation."""
         return cls(*eqx.partition(method, eqx.is_array), None if method.exact else rtol)
 
     @property
@@ -64,12 +64,12 @@ class Propagator(AbstractPropagator):
 
 
 def moved_to(trajectory: Trajectory, t: Array) -> Trajectory:
-    """The trajectory at times (K,) or (..., K) of its dtype, in any order; see ``at``."""
+    """The trajectory at times (K,) or (..., K) of its dtype, in any order, as ``Trajectory.at``."""
     return _at_times(trajectory, t, False)
 
 
 def moved_through(trajectory: Trajectory, t: Array) -> Trajectory:
-    """The same for times in order, from the first sample on: for many, all over the motion."""
+    """``moved_to`` for sorted times, by one integration from the first sample: faster for many."""
     return _at_times(trajectory, t, True)
 
 
@@ -80,11 +80,11 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     samples = [x.reshape(-1, *x.shape[len(batch) :]) for x in trajectory._samples]
     finite, times = jnp.isfinite(t), t
-    if ts.ndim > 1 or times.ndim > 1:  # one row a body
+    if ts.ndim > 1 or times.ndim > 1:  # one row for each body
         ts, times = (lane_times(jnp.atleast_2d(x), batch) for x in (ts, times))
     times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
     move = _from_first if in_order or propagator.method.exact else _from_nearest
-    # nothing is computed from a sample that is NaN where there are derivatives
+    # when derivatives are computed, bodies with NaN samples get finite ones: see ``_failed``
     inputs = jax.tree.leaves(eqx.filter((parts, samples, t), eqx.is_inexact_array))
     is_sound = jnp.isfinite(sum(x.sum((-1, -2)) for x in samples)) | ~is_differentiated(inputs)
     samples = [jnp.where(is_sound[:, None, None], x, 0.5) for x in samples]
@@ -93,7 +93,7 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     is_finite = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
     status = status.reshape(batch)
     steps = jax.tree.map(lambda x: x.reshape(batch), steps)
-    # a body of which more events were counted than stored has moved as it should
+    # the samples of a body with more events than can be stored are valid
     good = (trajectory.status == Status.SUCCESSFUL) | (trajectory.status == Status.TOO_MANY_EVENTS)
     samples = [jnp.where(is_finite, x, jnp.nan) for x in (wxyz, omega, *spins)]
     status = jnp.where(good, status, trajectory.status)
@@ -111,7 +111,7 @@ def _until_event(ending: Ending, times: Array, batch: tuple[int, ...]) -> Array:
 
 
 def with_initial_spins(scene: Scene, spins: list[Array]) -> Scene:
-    """The scene with these momenta of its coupled wheels, if there are such."""
+    """The scene with these initial momenta of its coupled wheels, if it has any."""
     if not spins or not isinstance(scene.rotors, Wheels):
         return scene
     return Scene(
@@ -120,7 +120,7 @@ def with_initial_spins(scene: Scene, spins: list[Array]) -> Scene:
 
 
 def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
-    """From the first sample: an exact law holds at every time."""
+    """States at ``times`` (sorted, or in any order for a closed form) from the first sample."""
     wxyz, omega, *spins = (x[:, 0] for x in samples)
     times = jnp.concatenate([ts[..., :1], times], axis=-1)
     rtol = None if propagator.rtol is None else jnp.min(propagator.rtol)
@@ -132,10 +132,9 @@ def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
 
 
 def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
-    """From the sample nearest to each time, of which a body may have many."""
-    rtol = jnp.min(
-        propagator.rtol
-    )  # of a trajectory that came out of vmap one for each body, all equal
+    """States at each time by integration from the nearest sample."""
+    # a trajectory returned by vmap has one tolerance for each body; all are equal
+    rtol = jnp.min(propagator.rtol)
     final = Record(final_only=True)
     unit = _gap(ts, times)
 
@@ -146,7 +145,7 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
         is_sample_time = begin == end
         span = jnp.stack([begin, jnp.where(is_sample_time, begin + unit, end)], axis=-1)
         result = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)
-        # where no time passes, the sample itself, with its derivatives by the time
+        # at the time of a sample: the sample itself, with its time derivatives
         step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
         is_sample = jnp.broadcast_to(is_sample_time[..., None], step.shape)
         end_states = [
@@ -191,9 +190,10 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
 def shortly_after(
     trajectory: Trajectory, shift: list[Array] | None = None
 ) -> tuple[list[Array], Callable[[Array], Trajectory]]:
-    """Rates of the samples, and a function of delays (..., T) [s] so short that three terms of the
-    Taylor series of the samples lead there: of what is no later but for its derivatives, values and
-    two derivatives. ``shift``: of attitudes, rates and times to where the rates are evaluated."""
+    """Time derivatives of the samples, and a function of short delays (..., T) [s] that returns the
+    trajectory later by these, by its Taylor series to second order: for delays of value zero it
+    gives the values with correct first and second derivatives. ``shift``: changes of attitudes,
+    rates and times at which the derivatives are evaluated."""
     t = trajectory
     rates, along = _along(t._scene, t._samples, t._t, shift)
 
@@ -206,8 +206,8 @@ def shortly_after(
 def _along(
     scene: Scene, samples: list[Array], t: Array, shift: list[Array] | None = None
 ) -> tuple[list[Array], Callable[[Array], list[Array]]]:
-    """Rates of samples (..., 4), (..., 3) and momenta of coupled wheels, and a function of a step
-    (..., 1) [s]: the samples that much later."""
+    """Time derivatives of samples (..., 4), (..., 3) and of momenta of coupled wheels, and a
+    function of a step (..., 1) [s] that returns the samples later by it; see ``shortly_after``."""
 
     def rates(samples, t):
         wxyz, omega, *spins = samples
@@ -236,7 +236,7 @@ def _along(
 
 
 def _nearest(ts: Array, times: Array) -> Array:
-    """Places (K,) in ``ts`` (T,), in any order, of what is nearest to each of ``times`` (K,)."""
+    """Indices (K,) of the nearest of ``ts`` (T,), which need not be sorted, to ``times`` (K,)."""
     ts, times = jax.lax.stop_gradient((ts, times))
     order = jnp.argsort(ts)
     later = jnp.clip(jnp.searchsorted(ts[order], times), 0, ts.shape[0] - 1)
@@ -246,7 +246,7 @@ def _nearest(ts: Array, times: Array) -> Array:
 
 
 def _gap(ts: Array, times: Array) -> Array:
-    """A time that a step may take in place of none at all; () or (N, K)."""
+    """A positive duration () or (N, K) in place of zero, for integrations that are not used."""
     ts, times = jax.lax.stop_gradient((ts, times))
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
     size = jnp.max(jnp.abs(ts), axis=-1)

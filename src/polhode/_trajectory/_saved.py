@@ -21,10 +21,11 @@ _CALLED = "ph.Record(save=), called as fn(trajectory)"
 
 
 def values_of(save: Callable, scene: Scene, ts: Array, samples: Samples) -> PyTree[Array]:
-    """``save`` of each of N bodies at ``ts`` (T,) or (N, T): leaves (N, T, ...).
+    """Values of ``save`` for each of N bodies at ``ts`` (T,) or (N, T): leaves (N, T, ...).
 
-    Rows of floats are NaN where the samples of a body are not finite; in programs of derivatives
-    all rows of such a body, for ``save`` gets numbers in place of NaN there: see ``_failed``.
+    Rows of floats are NaN where the samples of a body are not finite. When derivatives are
+    computed, all rows of such a body are NaN, because ``save`` is then called with finite numbers
+    in place of NaN: see ``_failed``.
     """
     lanes, shared = eqx.partition((scene, None), is_lane_tree((scene, None)))
     times, body_times = (None, ts) if ts.ndim > 1 else (ts, None)
@@ -99,7 +100,7 @@ def with_saved(trajectory: Trajectory, save: Callable) -> Trajectory:
 
 
 def final_of(*samples: Array | None) -> tuple[Array | None, ...]:
-    """The last samples (..., n) of attitude, rates and momenta of coupled wheels (..., T, n)."""
+    """The last of the samples (..., T, n) of attitude, rates and momenta of coupled wheels."""
     return tuple(None if x is None else x[..., -1, :] for x in samples)
 
 
@@ -136,12 +137,12 @@ def _at(path: Any) -> str:
 
 
 def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array]) -> Array:
-    """Mean of ``cost`` over the bodies of a batch that finished; others change no derivative.
+    """Mean of ``cost`` over the bodies of a batch that finished, with finite derivatives.
 
-    The states of a failed body are NaN, and so is a mean over all bodies. Masking the values alone
-    would not do: a derivative of ``jnp.where(mask, cost, 0)`` multiplies zero by NaN where the cost
-    has parameters of its own. ``cost`` therefore sees finite states in place of those of failed
-    bodies.
+    The states of a failed body are NaN, and so is a mean over all bodies. Masking the values is not
+    sufficient: a derivative of ``jnp.where(mask, cost, 0)`` multiplies zero by NaN if the cost has
+    parameters of its own. ``cost`` is therefore called with finite states in place of those of
+    failed bodies.
 
     **Arguments:**
 
@@ -166,9 +167,9 @@ def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array])
         return [x for x in (*t._samples, t._work, *final, *values) if x is not None]
 
     def finite(x):
-        if not jnp.issubdtype(x.dtype, jnp.inexact):  # a count that was saved
+        if not jnp.issubdtype(x.dtype, jnp.inexact):  # for example saved integers
             return x
-        # components of 0.5 are a unit quaternion, and rates whose norm has a derivative
+        # 0.5 in all components: a unit quaternion, and rates whose norm is differentiable
         mask = good.reshape(*batch, *(1,) * (x.ndim - len(batch)))
         return jnp.where(mask, x, jnp.asarray(0.5, x.dtype))
 
@@ -190,7 +191,7 @@ def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array])
 
 
 def _nothing(trajectory: Trajectory, count: Array) -> Array:
-    """Zero; NaN if no body finished, with derivatives NaN by the numbers of the scene."""
+    """Zero; if no body finished, NaN with NaN derivatives with respect to the scene's numbers."""
     factor = jnp.where(count > 0, 0, jnp.nan).astype(count.dtype)
     total = jnp.zeros((), count.dtype)
     for x in jax.tree.leaves(eqx.filter(trajectory.scene, eqx.is_inexact_array)):

@@ -1,4 +1,4 @@
-"""The result of a simulation: sampled attitude and rates, everything else computed on demand."""
+"""The result of a simulation: samples of attitude and rates, with derived quantities on demand."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 
-@partial(jax.jit, static_argnums=2)  # one program, not one for each operation
+@partial(jax.jit, static_argnums=2)  # outside jit too, one program for all operations
 def _sample(wxyz: Array, omega: Array, place: int) -> tuple[Array, Array]:
     """Attitude and rates (...) of one sample."""
     return wxyz[..., place, :], omega[..., place, :]
@@ -51,7 +51,7 @@ def _derived(of: Callable[["Trajectory"], Any], trajectory: "Trajectory") -> Any
 
 
 class AbstractPropagator(eqx.Module):
-    """What moves the bodies of a trajectory to other times."""
+    """Computes a trajectory at other times."""
 
     @abc.abstractmethod
     def at(self, trajectory: "Trajectory", t: ArrayLike) -> "Trajectory":
@@ -61,10 +61,10 @@ class AbstractPropagator(eqx.Module):
 class Events(eqx.Module):
     """Events of each body in the order of the motion; see ``simulate(events=)``.
 
-    **Fields:** ``times`` (..., M) [s], inf where there is none; ``which`` (..., M): the place of
-    the event in ``events``, -1 where there is none; ``wxyz`` (..., M, 4) and ``omega_body``
-    (..., M, 3) [rad/s]: the states there, NaN where there is none; ``count`` (...): number of
-    events, which exceeds M if the status is ``TOO_MANY_EVENTS``.
+    **Fields:** ``times`` (..., M) [s], padded with inf; ``which`` (..., M): index of the event
+    function in ``events``, padded with -1; ``wxyz`` (..., M, 4) and ``omega_body`` (..., M, 3)
+    [rad/s]: the states at the events, padded with NaN; ``count`` (...): number of events, which
+    exceeds M if the status is ``TOO_MANY_EVENTS``.
     """
 
     times: Float[Array, "*b m"]
@@ -76,14 +76,14 @@ class Events(eqx.Module):
 
 class Ending(NamedTuple):
     """The event that ended the motion of each body (...): its time [s], inf without one, and the
-    sign of time steps of the motion, 1 or -1, which samples at the event alone do not show."""
+    sign of the time steps, 1 or -1, which is not known from samples at the event alone."""
 
     time: Array
     sign: Array
 
 
 class NotRecordedError(ValueError, AttributeError):
-    """A quantity that the simulation did not record: for ``hasattr`` a missing attribute."""
+    """Raised for a quantity that was not recorded; an AttributeError, so that ``hasattr`` works."""
 
 
 def _recorded(trajectory: Any, name: str, request: str) -> Any:
@@ -107,16 +107,16 @@ class Trajectory(eqx.Module):
 
     **Attributes:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space; ``omega_body``
     (..., T, 3) [rad/s]; ``status`` (...): ``ph.Status`` of each body; ``steps`` (...): steps of the
-    solver (0 for a closed form), and ``step_counts``: why they were not longer; ``scene``, with the
-    motion of its wheels fixed by the initial state; ``propagator``: method and tolerance, for
-    ``at``. On request: ``work``, ``motor_work``, ``error``, ``saved`` (see ``ph.Record``) and
-    ``event_time`` (``until=``). Where wheels have a coupling: ``spins`` (..., T, k), their momenta.
-    What was not recorded raises an error, both AttributeError and ValueError, that says how to
-    record it; ``hasattr(traj, "work")`` is False then.
+    solver (0 for a closed form), and ``step_counts``: what limited their size; ``scene``, with the
+    wheel momenta of the initial state; ``propagator``: method and tolerance, for ``at``. On
+    request: ``work``, ``motor_work``, ``error``, ``saved`` (see ``ph.Record``) and ``event_time``
+    (``until=``). For wheels with a coupling: ``spins`` (..., T, k), their momenta. Access to a
+    quantity that was not recorded raises an error, both AttributeError and ValueError, with the
+    option that records it; ``hasattr(traj, "work")`` is then False.
 
-    Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
-    samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample. A loop over a
-    batch yields its bodies; their number is in ``traj.batch_shape``.
+    Use ``traj.at(t)`` for times between the samples. For indexing, a trajectory is an array of
+    samples of shape (..., T): ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth
+    sample. A loop over a batch yields its bodies; their number is in ``traj.batch_shape``.
     """
 
     ts: Float[Array, "*t"]
@@ -226,20 +226,20 @@ class Trajectory(eqx.Module):
 
     @property
     def step_counts(self) -> StepCounts:
-        """How many steps (...) each body took, and what kept them short.
+        """Numbers of steps (...) of each body, in total and by what limited their size.
 
-        Many refused ones: the motion changes abruptly. At switches: a torque switches often; smooth
-        it, or widen its limit. At saved times: save fewer. Limited by stability: something decays
-        fast; weaken it, or use an implicit solver. Closed forms: 0.
+        Many rejected steps: the motion changes abruptly. At switches: a torque switches often;
+        smooth it, or widen its limit. At saved times: save fewer. Limited by stability: a mode
+        decays fast; weaken it, or use an implicit solver. Closed forms: 0.
         """
         return self._steps
 
     @property
     def work(self) -> Float[Array, "*b t"]:
-        """Work (..., T) [J] done from outside since the first time.
+        """Work (..., T) [J] done on the body and its wheels since the first time.
 
-        It includes external torques, potentials that change with time (also orbits) and the motors
-        of wheels, so that ``energy - work`` is constant.
+        It includes external torques, time-dependent potentials (also by orbits) and the motors of
+        wheels, so that ``energy - work`` is constant.
         """
         return _recorded(self, "work", "with record=ph.Record(work=True)")
 
@@ -247,13 +247,13 @@ class Trajectory(eqx.Module):
     def error(self) -> Float[Array, "*b"]:
         """Estimated error (...) [rad] of the attitude at the last time.
 
-        Without attitude it is the error of the rates, relative to their size.
+        Without attitudes it is the relative error of the rates.
         """
         return _recorded(self, "error", "with record=ph.Record(error=True)")
 
     @property
     def motor_work(self) -> Float[Array, "*b t m"]:
-        """The part (..., T, m) [J] of ``work`` that motor and friction of each wheel have done."""
+        """The part (..., T, m) [J] of ``work`` due to motor and friction of each wheel."""
         return _recorded(
             self, "motor_work", "with record=ph.Record(work=True) and wheels that turn"
         )
@@ -262,7 +262,7 @@ class Trajectory(eqx.Module):
     def spins(self) -> Float[Array, "*b t k"]:
         """Momenta (..., T, k) [kg m^2/s] of the k wheels with a coupling, in their order.
 
-        Each along the axis of its wheel, that of the rotation with the body included.
+        Each is along the axis of its wheel and includes the rotation of the body.
         """
         return _recorded(self, "spins", "only where a wheel has a coupling")
 
@@ -282,19 +282,19 @@ class Trajectory(eqx.Module):
 
     @property
     def saved(self) -> PyTree[Array]:
-        """The values of the function that was saved in place of the states; leaves (..., T, *k)."""
+        """Values of the function of ``ph.Record(save=fn)``; leaves (..., T, *k)."""
         return _recorded(self, "saved", "with record=ph.Record(save=fn)")
 
     def at(self, t: Float[ArrayLike, "*#b k"]) -> "Trajectory":
-        """The motion at other times ``t`` [s]: a trajectory of the same bodies at these.
+        """The trajectory of the same bodies at other times ``t`` [s].
 
-        ``t`` (K,) is shared by all bodies, (..., K) one row a body; a number is taken as (1,). In
-        any order, also outside the times simulated; beyond the ``event_time`` of a body its times
-        and samples are those of the event. Differentiable in ``t``, in the initial state
-        and in the numbers of the scene; under ``jit`` and ``vmap`` too. Closed forms are evaluated
-        at ``t``; an integrated motion is continued from the nearest sample, to ``rtol``, at the
-        cost of a few steps for each time. A time that is not finite gives NaN. ``work``,
-        ``motor_work`` and ``error`` are not available.
+        ``t``: (K,) shared by all bodies, or (..., K) with one row for each; a number counts as
+        (1,). The times may be in any order, also outside the simulated span; beyond the
+        ``event_time`` of a body its times and samples are those of the event. Differentiable with
+        respect to ``t``, the initial state and the numbers of the scene; works under ``jit`` and
+        ``vmap``. Closed forms are evaluated at ``t``; an integrated motion is continued from the
+        nearest sample with ``rtol``, which takes a few steps for each time. A time that is not
+        finite gives NaN. ``work``, ``motor_work`` and ``error`` are not available.
 
         Raises ValueError where attitude or rates were not recorded, SimulationError as
         ``ph.simulate`` does.
@@ -311,7 +311,7 @@ class Trajectory(eqx.Module):
         return self.propagator.at(self, t)
 
     def state_at(self, t: Float[ArrayLike, "*#b"]) -> State:
-        """Attitude and rates (...) at one time ``t`` [s], () or one for each body; see ``at``."""
+        """The state (...) at one time ``t`` [s], () or one for each body; see ``at``."""
         return self.at(jnp.asarray(t)[..., None]).last
 
     @property
@@ -347,11 +347,11 @@ class Trajectory(eqx.Module):
         )
 
     def __getitem__(self, key: Any) -> "Trajectory":
-        """Bodies and samples chosen as from an array of shape (..., T), body axes first.
+        """Bodies and samples, indexed as an array of shape (..., T), body axes first.
 
-        Integers, slices, ``...``, arrays of integers or truth values. ``traj[3]`` is the fourth
-        body (of one body: the fourth sample); ``traj[3, ::10]``, ``traj[..., -1]``: bodies first,
-        then times. The axis of time stays: an integer there keeps one sample.
+        Integers, slices, ``...``, arrays of integers or booleans. ``traj[3]`` is the fourth body
+        (without a batch the fourth sample); ``traj[3, ::10]``, ``traj[..., -1]``: bodies first,
+        then times. The time axis is preserved: an integer there selects a single sample.
         """
         bodies, times = split_key(key, len(self.batch_shape))
         shape = self.batch_shape
@@ -401,10 +401,10 @@ class Trajectory(eqx.Module):
         )
 
     def between(self, start: float, end: float) -> "Trajectory":
-        """The samples from ``start`` to ``end`` [s], both included; of one row of times.
+        """The samples from ``start`` to ``end`` [s], both included, if all bodies share the times.
 
-        Not under ``jit``, where the number of samples must be known: use ``at``, or a slice.
-        Raises ValueError where no sample lies there, or where bodies have times of their own.
+        Not for use under ``jit``, where the number of samples must be static: use ``at``, or a
+        slice. Raises ValueError for an empty interval, and if bodies have different times.
         """
         if not is_concrete(self.ts) or self.ts.ndim != 1:
             raise ValueError(
@@ -419,7 +419,7 @@ class Trajectory(eqx.Module):
                 " for times between samples use traj.at(times)."
             )
         first, last = int(places[0]), int(places[-1])
-        is_contiguous = last - first + 1 == places.size  # not where times are in another order
+        is_contiguous = last - first + 1 == places.size  # False for some unsorted times
         return self[..., slice(first, last + 1) if is_contiguous else places]
 
     @property
@@ -429,11 +429,11 @@ class Trajectory(eqx.Module):
 
     @property
     def successful(self) -> Array:
-        """Which bodies finished, (...) of bool."""
+        """Whether each body finished: booleans (...)."""
         return self.status == Status.SUCCESSFUL
 
     def _compiled(self, of: Callable[["Trajectory"], Any]) -> Any:
-        """What ``of`` makes of this trajectory, in one program that other records of it share."""
+        """``of(self)`` in one compiled program, independent of further records such as ``work``."""
         return _derived(of, self._without_records)
 
     @property
@@ -451,12 +451,12 @@ class Trajectory(eqx.Module):
 
     @property
     def _samples(self) -> list[Array]:
-        """Attitude, rates and momenta of coupled wheels (..., T, n), as far as there are such."""
+        """Attitude, rates and momenta of coupled wheels (..., T, n), those that were recorded."""
         return [x for x in (self._wxyz, self._omega_body, self._spins) if x is not None]
 
     @property
     def _scene(self) -> Scene:
-        """The scene with arrays shaped to broadcast against (..., T) samples."""
+        """The scene with arrays shaped to broadcast against samples (..., T)."""
         rank = len(self.batch_shape)
         parts = {name: along_time(getattr(self.scene, name), rank) for name in PARTS}
         spins = () if self._spins is None else tuple(jnp.moveaxis(self._spins, -1, 0))
@@ -468,7 +468,7 @@ class Trajectory(eqx.Module):
 
     @property
     def momentum_body(self) -> Float[Array, "*b t 3"]:
-        """Angular momentum (..., T, 3) in body axes, that of rotors included [kg m^2/s]."""
+        """Angular momentum (..., T, 3) in body axes, rotors included [kg m^2/s]."""
         _ = self.omega_body  # must have been recorded
         return self._compiled(_momentum_body)
 
@@ -499,11 +499,11 @@ class Trajectory(eqx.Module):
 
     @property
     def energy(self) -> Float[Array, "*b t"]:
-        """Kinetic plus potential energy [J]: the one Hamiltonian at every sample.
+        """Kinetic plus potential energy (..., T) [J]: the Hamiltonian at every sample.
 
-        Of wheels that spin freely or by a motor the spin energy is included; with wheels of
-        prescribed speed it is the energy of the body with the wheels locked, which is constant
-        then. It changes by ``work`` and by nothing else (but a potential that jumps in time).
+        It includes the spin energy of wheels that spin freely or are driven by a motor. For wheels
+        of prescribed speed it is the energy of the body with the wheels locked, which is constant
+        then. It changes only by ``work`` (and by potentials that are discontinuous in time).
         """
         _ = self.omega_body  # must have been recorded
         if self.scene.potential is not None:
@@ -515,9 +515,9 @@ class Trajectory(eqx.Module):
     ) -> tuple[Array, Array, Array]:
         """Euler angles [rad], each (..., T): by default ZYZ (phi, theta, psi).
 
-        ``sequence``: a ``rotation.Sequence``, or its axes as SciPy writes them: ``"ZYX"`` turns
-        about the axes of the body one after the other (yaw, pitch, roll), ``"zyx"`` about those of
-        space. Angles are in the order of the axes. Raises ValueError for other letters.
+        ``sequence``: a ``rotation.Sequence``, or its axes in SciPy's notation: ``"ZYX"`` for
+        successive rotations about body axes (yaw, pitch, roll), ``"zyx"`` about space axes. Angles
+        are in the order of the axes. Raises ValueError for other letters.
         """
         return rotation.wxyz_to_euler(self.wxyz, sequence)
 
@@ -525,17 +525,17 @@ class Trajectory(eqx.Module):
         """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
 
         In the order of ``wxyz`` with its leading axes flattened. Conversely, ``ph.State`` accepts a
-        ``Rotation`` in place of a quaternion. Not under ``jit``. Raises ValueError where attitudes
-        are NaN, those of bodies that did not finish.
+        ``Rotation`` in place of a quaternion. Not under ``jit``. Raises ValueError if attitudes are
+        NaN, as those of bodies that did not finish.
         """
         return scipy_rotation(self.wxyz)
 
     def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
         """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
 
-        It holds all that was recorded: states and what follows from them, ``saved`` (an array of a
-        dictionary as ``saved_<key>``), ``event_time`` and, as ``events_<field>``, ``events``.
-        ``labels``: names of the bodies of a batch of one axis, the coordinate ``body``.
+        It contains all records: states and derived quantities, ``saved`` (arrays of a dictionary as
+        ``saved_<key>``), ``event_time`` and, as ``events_<field>``, ``events``. ``labels``: names
+        of the bodies of a batch with one axis, for the coordinate ``body``.
         """
         return dataset(self, labels)
 
@@ -544,19 +544,19 @@ class Trajectory(eqx.Module):
 
         **Arguments:** ``path``; ``epoch``: calendar time at which ``ts`` is zero, such as
         ``"2029-04-13T21:46:00"``; fields of the message: ``object_name`` and ``object_id``
-        (required; for a batch one for each body), ``frame`` ("EME2000": that of space),
+        (required; for a batch one for each body), ``frame`` ("EME2000": the space frame),
         ``body_frame`` ("SC_BODY_1"), ``time_system`` ("TAI"), ``originator`` ("POLHODE"),
         ``center_name`` (None), ``rates`` (True: body rates too), ``creation_date`` (now).
 
-        One segment a body, in the order of time. Seconds are counted on from ``epoch``: do not use
-        ``time_system="UTC"`` across a leap second. Raises ValueError or TypeError for fields that
-        the standard does not know, FileNotFoundError for a folder that is not there.
+        One segment per body, by increasing time. Times are ``epoch`` plus seconds without leap
+        seconds: do not use ``time_system="UTC"`` across one. Raises ValueError or TypeError for
+        fields that the standard does not allow, FileNotFoundError for a missing folder.
         """
         write_aem(path, self, epoch, **fields)
 
 
 def _spread(counts: np.ndarray) -> str:
-    """The median of numbers of bodies, and their range."""
+    """The median of the bodies' counts, and their range, as text."""
     minimum, median, maximum = counts.min(), np.median(counts), counts.max()
     return f"{median:,.0f}" + (
         "" if minimum == maximum else f", at least {minimum:,}, at most {maximum:,}"

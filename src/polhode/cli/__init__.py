@@ -11,13 +11,13 @@ from polhode._extras import how_to_install
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code.
 
-    0: done; 1: the computation or the writing failed; 2: wrong usage or wrong input, such as a file
+    0: success; 1: the computation or the output failed; 2: wrong usage or input, such as a file
     that is missing, malformed or of another kind; 130: interrupted (Ctrl-C).
 
     Raises SystemExit for --help, wrong options and termination (143).
     """
-    # Of programs in its cache, jaxlib 0.10.0 reports flags of its own as features that the machine
-    # lacks, as errors. To be set before JAX is imported; what fails is raised as an exception.
+    # jaxlib 0.10.0 logs false errors about missing CPU features when it loads programs from its
+    # cache. The level must be set before JAX is imported. Real errors are raised as exceptions.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         from polhode.cli._main import main as command_line
@@ -30,15 +30,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def command() -> None:
-    """The `polhode` command: `main`, which ends the process.
+    """The `polhode` command: runs `main` and ends the process with its exit code.
 
-    After an interrupt or termination at once: the threads of an ensemble would first complete
-    their chunks, and where the interrupt met code made from text, as imports of data classes do,
-    ``python -m`` would end by the signal and not with the exit code, though it was caught.
+    After an interrupt or termination it ends by ``os._exit``: otherwise the threads of an ensemble
+    would first complete their chunks; and if an interrupt, though caught, occurred in code compiled
+    from a string, as in the import of a data class, ``python -m`` would end by the signal and not
+    with the exit code.
     """
     try:
         code = main()
-    except KeyboardInterrupt:  # before the command line was read
+    except KeyboardInterrupt:  # before the command line was parsed
         code = 130
     except SystemExit as ended:
         if ended.code != 143:

@@ -40,7 +40,7 @@ def explain(
     precision: PrecisionOption = "float64",
     debug: DebugOption = False,
 ) -> int:
-    """Explain which method computes a scene, and why, without computing it."""
+    """Explain which method would simulate a scene, and why, without running it."""
     file = read_scene(scene, clones, seed)
     import polhode
     from polhode.cli._job import prepare
@@ -81,7 +81,7 @@ def scenes(
     force: ForceOption = False,
     debug: DebugOption = False,
 ) -> int:
-    """List the scenes that come with polhode, which `polhode run NAME` runs; or copy one."""
+    """List the scenes that come with polhode, or copy one. `polhode run NAME` runs a scene."""
     import tomllib
 
     from polhode._atomic import atomic_write
@@ -101,7 +101,8 @@ def scenes(
         raise UsageError(f"there is no scene {name!r}: there are {', '.join(shipped)}{hint}")
     check_suffix(output or "", ".toml", what="a scene file")
     path = output_path(output or name, ".toml", force=True)
-    if os.path.lexists(path) and not force:  # a copy that was edited names polhode too
+    # not left to ``output_path``: an edited copy also names polhode as its maker
+    if os.path.lexists(path) and not force:
         raise FileExistsError(
             f"{path} exists: name another file with -o, or give --force to replace it"
         )
@@ -119,9 +120,9 @@ def reference(
     force: ForceOption = False,
     debug: DebugOption = False,
 ) -> int:
-    """Write motions of free rigid bodies that are correct to 17 digits, to test a program against.
+    """Write reference motions of torque-free bodies, correct to 17 digits, to test other programs.
 
-    Attitudes, rates, flip times and their derivatives of 14 bodies at times up to 1e5 revolutions.
+    Attitudes and rates of 14 bodies with their derivatives, up to 1e5 revolutions, and flip times.
     """
     from polhode._atomic import atomic_write
     from polhode.files._write import REFERENCE, reference_csv
@@ -140,7 +141,7 @@ def reference(
 
 
 def _is_earlier(name: str, text: str) -> bool:
-    """Whether a file begins as the one to write: a table does not name its maker."""
+    """Whether a file begins like the one to write, because a CSV table does not name its maker."""
     path, start = Path(name), text[:200].encode()
     if not path.is_file() or path.is_symlink():
         return False
@@ -157,12 +158,12 @@ def view(
     force: ForceOption = False,
     debug: DebugOption = False,
 ) -> int:
-    """Write one HTML page that shows the motion of a file: it needs no network."""
+    """Write an HTML page that animates the motion in a NetCDF file. The page works offline."""
     if output is not None:
         check_suffix(output, ".html", ".htm", what="a page")
     expected = "a NetCDF file (.nc) that `polhode run` wrote"
     with usage_errors(path, ".nc", expected):
-        pass  # before JAX is imported
+        pass  # checks the file before the slow import of JAX
     require("view", "xarray", "h5netcdf", "h5py")
     from polhode import plot
 
@@ -176,7 +177,7 @@ def view(
     return 0
 
 
-_PHASES = ("seeliger", "linear", "hg", "hg1g2")  # known before JAX is imported
+_PHASES = ("seeliger", "linear", "hg", "hg1g2")  # the keys of ``PHASES``, without importing JAX
 
 
 def _phase(text: str) -> str:
@@ -253,7 +254,7 @@ def lightcurve(
     quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> int:
-    """Spin and inertia of a tumbling body from its brightness."""
+    """Estimate spin and inertia of a tumbling body from its light curve."""
     expected = "a light curve: CSV with a header line, ALCDEF or DAMIT's lc.txt"
     if output is not None:
         output = output_stem(output, ".png", ".json", what="the figure and the numbers")
@@ -300,7 +301,7 @@ def lightcurve(
                 progress=show,
                 reading=reading,
             )
-    except ValueError as error:  # a brightness that does not vary
+    except ValueError as error:  # for example of a constant brightness
         raise UsageError(f"{path}: {error}") from error
     if not quiet:
         print("\n".join(lines))

@@ -34,7 +34,7 @@ _EXPECTED = "a recording: CSV with a header line"
 
 
 class _Options(NamedTuple):
-    """What is fitted and how, as the command line says it; stored with the result."""
+    """Options of the fit from the command line, which are stored with the result."""
 
     degrees: bool
     milliseconds: bool
@@ -145,8 +145,8 @@ def fit(
     debug: DebugOption = False,
 ) -> int:
     """Fit the inertia of a tumbling body to a CSV file of times and gyroscope rates. Writes the
-    numbers (JSON) and a figure (PNG) and prints a summary. Exit code 1 when the fit must not be
-    used, or when the recording does not show all ratios of the moments.
+    numbers (JSON) and a figure (PNG) and prints a summary. Exit code 1 if the fit is unusable or
+    the recording does not determine all ratios of the moments.
     """
     path, names = _columns(recording, columns)
     with usage_errors(path, ".csv", _EXPECTED):
@@ -193,7 +193,10 @@ def fit(
 
 
 def _columns(words: list[str], options: list[str]) -> tuple[Path, dict[str, str]]:
-    """The recording and what --columns says, whose later items stand among the arguments."""
+    """The path of the recording and the columns by role.
+
+    ``--columns`` takes one value; further NAME=COLUMN items are among the arguments ``words``.
+    """
     items = [word for word in words if word.partition("=")[0] in _ROLES and "=" in word]
     files = [word for word in words if word not in items]
     invalid = [x for x in options if x.partition("=")[0] not in _ROLES or not x.partition("=")[2]]
@@ -219,7 +222,7 @@ def _output(recording: Path, output: str | None, suffix: str, force: bool) -> Pa
 def _fit(
     path: Path, names: dict[str, str], options: _Options, show: Callable[[str], None]
 ) -> tuple[Any, Any]:
-    """The recording as it was read, and the result of the fit."""
+    """The loaded recording and the result of the fit."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -230,14 +233,14 @@ def _fit(
     fit_options = _fit_options(options)
     try:
         result = fits.fit_recordings([loaded.recording], throw=False, options=fit_options)
-    except ValueError as error:  # the recording does not suit the options
+    except ValueError as error:  # options that do not apply to the recording
         raise UsageError(f"{path}: {error}") from error
     check_signals()
     return loaded, result
 
 
 def _exit_code(result: Any, allow_undetermined: bool) -> int:
-    """0 when the result can be used; otherwise 1, and a message."""
+    """0 if the result is usable; otherwise 1, with a message on stderr."""
     if not result.is_usable:
         findings = ", ".join(result.findings())
         print(f"polhode: the fit must not be used: {findings}", file=sys.stderr)
@@ -276,7 +279,7 @@ def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
 
 
 def _columns_read(loaded: Any) -> str:
-    """Which columns were read, in which units."""
+    """A line with the columns that were read and their units."""
     from polhode.files._read import escape
 
     names = ", ".join(f"{role} = {escape(name)}" for role, name in loaded.columns.items())
@@ -310,7 +313,7 @@ def _fit_options(options: _Options) -> Any:
 
 
 def _undetermined(result: Any) -> bool:
-    """Whether a ratio of the moments is not shown at all, or to no better than its own size."""
+    """Whether the standard deviation of a ratio is infinite, or more than half of the ratio."""
     import numpy as np
 
     spread = np.asarray(result.ratios_std)[..., :2]
@@ -328,8 +331,8 @@ def _bias(result: Any) -> tuple[Any, Any] | None:
 
 
 def _drag(result: Any) -> dict[str, tuple[float, float]] | None:
-    """Coefficients of the drag and their standard deviations by name, over the largest moment where
-    the size of the inertia is not known; None where no drag was fitted."""
+    """Drag coefficients and their standard deviations by name, divided by the largest moment if the
+    size of the inertia is not known; None if no drag was fitted."""
     import jax.numpy as jnp
 
     places = [k for k, name in enumerate(result.value_names) if name.startswith("drag.")]
@@ -420,7 +423,7 @@ def _print(path: Path, options: _Options, loaded: Any, result: Any, written: lis
 
 
 def _observability(result: Any) -> Any:
-    """What this recording can show, as a rich Table."""
+    """``Fit.observability`` as a rich Table."""
     from rich.table import Table
     from rich.text import Text
 
@@ -473,7 +476,7 @@ def _table(path: Path, options: _Options, recording: Any, result: Any) -> Any:
             name,
             f"{values[k]:.6g}",
             interval if high[k] - values[k] <= values[k] else "not determined",
-            # without negative zeros
+            # + 0.0 removes negative zeros
             "({:.3f}, {:.3f}, {:.3f})".format(*(np.round(axes[:, k], 3) + 0.0)),
             "given" if options.moments_only else angle,
         )

@@ -1,4 +1,4 @@
-"""What `polhode run` computes: the batch of a scene file, chunk by chunk; and its summary."""
+"""The computation of `polhode run`: the bodies of a scene file in chunks, and the summary."""
 
 import dataclasses
 import os
@@ -29,14 +29,14 @@ MEANINGS = {
     "P_psi": "turn about long axis",
     "P_phi": "mean precession",
 }
-_CHUNKS, _MIN_CHUNK = 20, 50  # pieces of progress, and bodies below which a piece does not pay
+_CHUNKS, _MIN_CHUNK = 20, 50  # number of chunks, for progress, and least bodies of a chunk
 
 
 class Job(NamedTuple):
-    """A scene ready to run: body 0 is the nominal one.
+    """A scene ready to run; body 0 is the nominal one.
 
-    `all_ts` are the sample times `ts` and those of the observations among them, in one row, so that
-    one compiled program gives both.
+    `all_ts` merges the sample times `ts` and the times of the observations within their span, so
+    that one compiled program computes both.
     """
 
     file: SceneFile
@@ -64,8 +64,8 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The trajectory of all bodies, the misfit of the nominal one, the times [s] of events by name
-    (bodies, M), NaN where there are fewer than M, and the seconds that it took.
+    """The trajectory of all bodies, the residuals of the nominal one, the event times [s] by name
+    (bodies, M), padded with NaN, and the durations of compilation and simulation [s].
     """
 
     trajectory: polhode.Trajectory
@@ -76,7 +76,7 @@ class Outcome(NamedTuple):
 
 
 def prepare(file: SceneFile, precision: str) -> Job:
-    """Build the scene in this precision; switches 64-bit numbers on for this process."""
+    """Build the scene in this precision. Enables ``jax_enable_x64`` for the process."""
     jax.config.update("jax_enable_x64", True)
     dtype = np.dtype(precision)
     _require_memory(file, dtype.itemsize)
@@ -99,9 +99,9 @@ def prepare(file: SceneFile, precision: str) -> Job:
 
 
 def _require_memory(file: SceneFile, itemsize: int) -> None:
-    """MemoryError now, rather than a process that the system ends, for what cannot fit."""
+    """MemoryError for a scene that exceeds the memory, before the system kills the process."""
     bodies = 1 if file.monte_carlo is None else file.monte_carlo.clones + 1
-    # attitude, rates, energy and momentum of every sample, and as much again to write them
+    # attitude, rates, energy and momentum of every sample (11 numbers), twice: a copy for writing
     required = 2 * 11 * itemsize * bodies * len(file.times.seconds)
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -115,14 +115,14 @@ def _require_memory(file: SceneFile, itemsize: int) -> None:
 
 
 def _within(seconds: np.ndarray, ts: np.ndarray) -> np.ndarray:
-    """The observed times that lie in the simulated span, in the dtype of `ts`."""
+    """The observation times within the simulated span, in the dtype of `ts`."""
     seconds = seconds.astype(ts.dtype)
     return seconds[(seconds >= ts.min()) & (seconds <= ts.max())]
 
 
 class _CompileClock:
-    """Seconds in which JAX was tracing or compiling: the union of what it reports, for a function
-    traced inside another one is reported with both.
+    """The time during which JAX was tracing or compiling: the union of the reported intervals,
+    because the interval of a nested function is contained in that of the outer one.
     """
 
     def __init__(self):
@@ -146,10 +146,10 @@ jax.monitoring.register_event_duration_secs_listener(_CLOCK.listen)
 
 
 def run(job: Job, progress: Callable[[int], None]) -> Outcome:
-    """Simulate all bodies in chunks, calling `progress` with how many are finished after each.
+    """Simulate all bodies in chunks; `progress` is called with the number of finished bodies.
 
-    Raises SimulationError when the nominal body does not finish; clones that do not are found in
-    the trajectory's `status`.
+    Raises SimulationError if the nominal body does not finish; the trajectory's `status` reports
+    clones that do not.
     """
     start_time = time.perf_counter()
     total = job.bodies
@@ -160,7 +160,8 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     events = build_events(job.file, job.ts.dtype)
     times: dict[str, list[np.ndarray]] = {name: [] for name in events}
     for start in range(0, total, size):
-        first = min(start, total - size)  # the last chunk overlaps: all have one shape
+        # the last chunk overlaps the one before, so that all have one shape
+        first = min(start, total - size)
         piece = _simulate(job, slice(first, first + size) if job.batch_shape else None)
         if start == 0:
             _require_nominal(np.asarray(piece.status))
@@ -189,7 +190,7 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
 
 
 def _pad(rows: list[np.ndarray]) -> np.ndarray:
-    """Rows of times, infinite where there is none, as one array with NaN there."""
+    """Rows of event times, padded with infinity, as one array padded with NaN."""
     width = max(int(np.isfinite(row).sum()) for row in rows)
     padded = np.full((len(rows), width), np.nan)
     for place, row in zip(padded, rows):
@@ -199,7 +200,7 @@ def _pad(rows: list[np.ndarray]) -> np.ndarray:
 
 
 def _index(job: Job, ts: np.ndarray) -> np.ndarray:
-    """Where the times `ts` stand among all times."""
+    """Indices of the times `ts` in `job.all_ts`."""
     if job.all_ts[0] < job.all_ts[-1]:
         return np.searchsorted(job.all_ts, ts)
     return len(job.all_ts) - 1 - np.searchsorted(job.all_ts[::-1], ts)
@@ -228,7 +229,8 @@ def _require_nominal(status: np.ndarray) -> None:
 
 
 class Residuals(NamedTuple):
-    """Observed against computed: rotation angle, rad (n,), and body rates, rad/s (n, 3)."""
+    """Differences between observation and simulation at `seconds`: rotation angle [rad] (n,), and
+    body rates [rad/s] (n, 3)."""
 
     seconds: np.ndarray
     angle: np.ndarray
@@ -236,7 +238,7 @@ class Residuals(NamedTuple):
 
 
 def _residuals(job: Job, piece: polhode.Trajectory) -> Residuals | None:
-    """The nominal body against the file's observations within the times; None without any."""
+    """Residuals of the nominal body at the observations within the span; None without any."""
     observations = job.file.observations
     if observations is None:
         return None
@@ -252,7 +254,7 @@ def _residuals(job: Job, piece: polhode.Trajectory) -> Residuals | None:
 
 
 class Figures(NamedTuple):
-    """Figures of merit of a run; `periods` name -> (bodies,) s, empty unless the body is free."""
+    """Figures of merit of a run; `periods`: name -> (bodies,) [s], empty unless torque-free."""
 
     periods: dict[str, np.ndarray]
     modes: list[str]
@@ -268,10 +270,10 @@ def _has_orbit(scene: polhode.Scene) -> bool:
 
 
 def measure(job: Job, outcome: Outcome) -> Figures:
-    """Periods of every body; the largest change of energy and of angular momentum in space.
+    """Periods of every body; the largest relative changes of energy and momentum in space.
 
-    Energy is given where no torque, no motor and no potential that changes along an orbit works on
-    the body, momentum where nothing acts.
+    These only for conserved quantities: energy without torques, rotors, a variable inertia and an
+    orbit, momentum of torque-free bodies.
     """
     scene, trajectory = job.scene, outcome.trajectory
     energy = momentum = None
@@ -325,7 +327,7 @@ def summary_table(job: Job, outcome: Outcome, figures: Figures):
         cells = [name, nominal]
         cells += [spread] if clones else []
         cells += [published] if file.published else []
-        grid.add_row(*map(Text, cells))  # Text: brackets are units here, not markup
+        grid.add_row(*map(Text, cells))  # Text: the brackets of units are not markup
 
     if figures.periods:
         for name, meaning in MEANINGS.items():
@@ -359,7 +361,7 @@ def _spread(values: np.ndarray) -> str:
 
 
 def _first_times(first: np.ndarray, count: np.ndarray) -> str:
-    """Mean and spread of the first times of the clones that have one."""
+    """Mean and standard deviation of the first event times of the clones with an event."""
     if not count.any():
         return "none"
     first = first[count > 0]

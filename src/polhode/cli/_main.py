@@ -1,6 +1,6 @@
-"""The `polhode` command: its commands, exit codes and errors in one readable block.
+"""The `polhode` command: its subcommands, exit codes and error messages.
 
-Nothing heavy is imported before a command runs, so that `--help` and mistakes answer at once.
+JAX is not imported before a command runs, so that `--help` and error messages appear quickly.
 """
 
 import difflib
@@ -29,7 +29,7 @@ _arguments: list[str] = []
 
 
 def arguments() -> list[str]:
-    """The arguments of the command that runs."""
+    """The arguments of the current command."""
     return list(_arguments)
 
 
@@ -48,7 +48,7 @@ _SYNONYMS = {
 
 
 class _Commands(typer.core.TyperGroup):
-    """The commands; an unknown one is answered with the command that was probably meant."""
+    """The commands; the error for an unknown one suggests a similar command."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name = args[0]
@@ -58,7 +58,8 @@ class _Commands(typer.core.TyperGroup):
 
 
 def _hint(name: str) -> str:
-    """A hint for an unknown command: one of the same meaning, or of a similar name."""
+    """A hint for an unknown command: the command that reads such a file, a synonym, or a command
+    with a similar name."""
     if reader := READERS.get(Path(name).suffix):
         return f" It is the name of a file: {reader}."
     for command, others in _SYNONYMS.items():
@@ -98,7 +99,7 @@ def _top(
 
 
 def _guarded(command: Callable[..., int]) -> Callable[..., None]:
-    """The command with every error printed in one block; its exit code is noted for `main`."""
+    """The command with all errors printed as messages; its exit code is stored for `main`."""
 
     @functools.wraps(command)
     def guarded(*arguments: Any, **options: Any) -> None:
@@ -108,8 +109,9 @@ def _guarded(command: Callable[..., int]) -> Callable[..., None]:
     return guarded
 
 
-# Thresholds of garbage collection. Tracing a fit makes millions of objects that stay alive; at
-# Python's thresholds, scanning them takes a sixth of the time of a command with cached programs.
+# Thresholds of garbage collection. Tracing a fit creates millions of long-lived objects. With
+# Python's default thresholds their repeated scanning takes a sixth of the time of a command with
+# cached programs.
 _GC_THRESHOLDS = (200_000, 50, 100)
 
 
@@ -119,8 +121,8 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
     gc.set_threshold(*_GC_THRESHOLDS)
     try:
         with signal_handlers(), warnings.catch_warnings():
-            # the status shows numbers that overflow, and letters without a glyph are drawn as
-            # boxes; other warnings are printed without their place in the source
+            # ``status`` reports overflows, and missing glyphs in figures are visible as boxes:
+            # both warnings are ignored. Others are printed without their source location.
             warnings.simplefilter("ignore", RuntimeWarning)
             warnings.filterwarnings("ignore", "Glyph", UserWarning)
             warnings.showwarning = _print_warning
@@ -134,7 +136,7 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
         if ended.code == TERMINATED:
             print(f"\npolhode: terminated; {state_of_outputs()}", file=sys.stderr)
         raise
-    except BrokenPipeError:  # the reader of our output went away: nobody reads it
+    except BrokenPipeError:  # the reader of the output has closed the pipe
         _silence(sys.stdout)
         return FAILURE
     except Exception as error:
@@ -148,23 +150,23 @@ def _print_warning(message: Warning | str, *_: Any) -> None:
 
 
 def _report(error: Exception, debug: bool) -> int:
-    """Print the error to stderr; the exit code that belongs to it."""
+    """Print the error to stderr and return its exit code."""
     if debug:
         traceback.print_exception(error)
     bad_input = isinstance(error, SceneFileError | UsageError)
     text = str(error) or type(error).__name__
     if isinstance(error, MemoryError):
-        text = f"not enough memory ({text}): ask for fewer bodies or times, or use an [ensemble]"
+        text = f"not enough memory ({text}): use fewer bodies or times, or use an [ensemble]"
     expected = bad_input or isinstance(error, OSError | ImportError | RuntimeError | MemoryError)
     lead = "" if expected else f"{type(error).__name__}: "
     hint = "" if expected or debug else "\n  (run again with --debug to see where)"
-    if isinstance(error, OSError) and error.strerror:  # str() begins with the number of the error
+    if isinstance(error, OSError) and error.strerror:  # without the errno that str() begins with
         text = ": ".join(str(part) for part in (error.filename, error.strerror) if part)
     block = "\n".join(map(escape, f"{lead}{text}{hint}".split("\n")))
     print(f"polhode: {block}", file=sys.stderr)
     try:
         sys.stdout.flush()
-    except OSError:  # a full disk behind a redirection: nothing more can go there
+    except OSError:  # output redirected to a full disk: discard the rest
         _silence(sys.stdout)
     return USAGE if bad_input else FAILURE
 

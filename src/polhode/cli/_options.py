@@ -1,6 +1,6 @@
-"""What commands share: options, scene files, and the files that they read and write.
+"""Common parts of the commands: options, scene files, and checks of input and output files.
 
-Names of files are checked before the work: where a file is, what is wrong, what may be replaced.
+File names are checked before the computation: whether a file exists, is readable, may be replaced.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
 def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
-    """A whole number not below `minimum` and not above `maximum`, if there is one."""
+    """Parser of an integer from `minimum` to `maximum` (None: no maximum)."""
     bounds = f"from {minimum} up" if maximum is None else f"from {minimum} to {maximum}"
 
     def convert(text: str | int) -> int:
@@ -41,7 +41,7 @@ def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], in
 
 
 def parse_part(text: str) -> str:
-    """I/N with I from 1 to N."""
+    """Parser of I/N with I from 1 to N."""
     first, _, last = text.partition("/")
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first[:9]) <= int(last[:9])):
         raise typer.BadParameter(f"{text[:80]!r} is not I/N with I from 1 to N, such as 3/8")
@@ -49,7 +49,7 @@ def parse_part(text: str) -> str:
 
 
 def positive(text: str | float) -> float:
-    """A finite number above 0."""
+    """Parser of a finite number above 0."""
     value = _number(text)
     if not 0 < value < math.inf:
         raise typer.BadParameter(f"{str(text)[:80]!r} is not a positive number")
@@ -57,7 +57,7 @@ def positive(text: str | float) -> float:
 
 
 def not_negative(text: str | float) -> float:
-    """A finite number, 0 or above."""
+    """Parser of a finite number, 0 or above."""
     value = _number(text)
     if not 0 <= value < math.inf:
         raise typer.BadParameter(f"{str(text)[:80]!r} is not a number from 0 up")
@@ -72,7 +72,7 @@ def _number(text: str | float) -> float:
 
 
 def byte_count(text: str | int) -> int:
-    """4GB, 500MB, 2e9: a byte or more."""
+    """Parser of a size such as 4GB, 500MB or 2e9; at least one byte."""
     match = re.fullmatch(r"([0-9.]+(?:e[0-9]+)?)\s*([kmgt]?)b?", str(text).strip().lower())
     try:
         count = int(float(match[1]) * _SIZES[match[2]])  # type: ignore[index]
@@ -84,7 +84,7 @@ def byte_count(text: str | int) -> int:
 
 
 def device_count(text: str) -> str:
-    """A number of devices, or all."""
+    """Parser of a number of devices, or "all"."""
     return text if text == "all" else str(whole_number(1)(text))
 
 
@@ -134,14 +134,14 @@ ForceOption = Annotated[
 NoFigureOption = Annotated[bool, typer.Option("--no-figure", help="do not draw the figure")]
 NoCacheOption = Annotated[
     bool,
-    typer.Option("--no-cache", help="do not keep compiled programs (or set POLHODE_CACHE=off)"),
+    typer.Option("--no-cache", help="do not store compiled programs (or set POLHODE_CACHE=off)"),
 ]
 QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="print errors only")]
 DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceback of an error")]
 
 
 def read_scene(scene: str, clones: int | None, seed: int | None) -> Any:
-    """The scene file with the options put in place of its own entries."""
+    """The scene file, with its number of clones and its seed replaced by the options."""
     from polhode.files import SceneFileError
 
     file = read_scene_file(scene)
@@ -176,7 +176,7 @@ def read_scene(scene: str, clones: int | None, seed: int | None) -> Any:
 
 
 def require(command: str, *packages: str, extra: str = "cli") -> None:
-    """ImportError now, rather than after the work, when a package is missing."""
+    """ImportError for a missing package, before the computation instead of after it."""
     import importlib.util
 
     from polhode._extras import how_to_install
@@ -194,12 +194,12 @@ READERS = {
     ".nc": "`polhode view` reads NetCDF files",
     ".zarr": "xarray.open_zarr reads the stores of ensembles",
 }
-_outputs: dict[Path, tuple[int, int] | None] = {}  # with what was there before
+_outputs: dict[Path, tuple[int, int] | None] = {}  # output files with their previous identity
 _stores: list[Path] = []
 
 
 class UsageError(Exception):
-    """Options that do not fit each other or the file: exit code 2."""
+    """Raised for options that do not fit each other or the file: exit code 2."""
 
 
 def scene_path(text: str) -> Any:
@@ -225,7 +225,7 @@ def scene_path(text: str) -> Any:
 
 
 def read_scene_file(text: str) -> Any:
-    """The checked scene file; a file that another command reads is named as such."""
+    """The validated scene file; the error for another kind of file names the command for it."""
     from polhode.files import read_scene
 
     path = scene_path(text)
@@ -240,9 +240,9 @@ def read_scene_file(text: str) -> Any:
 
 @contextlib.contextmanager
 def usage_errors(path: Path, suffix: str, expected: str) -> Iterator[None]:
-    """Turn what reading a file raises into UsageError: its name, what is wrong, what is expected.
+    """Convert errors of reading a file to UsageError with its name, the cause and what is expected.
 
-    A file that is missing or no file at all is refused at once.
+    Missing files and folders are rejected before the block runs.
     """
     hint = _other_command(path, suffix)
     end = f"\n  {hint}" if hint else ""
@@ -275,7 +275,7 @@ def usage_errors(path: Path, suffix: str, expected: str) -> Iterator[None]:
 
 
 def _suggestion(path: Path, suffix: str) -> str:
-    """A question that names the file meant by a path without a file, or nothing."""
+    """'did you mean ...?' with an existing file similar to a missing one, or an empty string."""
     try:
         names = {other.name for other in path.parent.iterdir() if other.suffix == suffix}
     except OSError:
@@ -289,25 +289,25 @@ def _closest(name: str, names: Any) -> str:
 
 
 def _other_command(path: Path, suffix: str) -> str:
-    """Which command reads a file whose suffix is not the one expected, or nothing."""
+    """The command that reads files with this suffix, or an empty string for the expected one."""
     return "" if path.suffix == suffix else READERS.get(path.suffix, "")
 
 
 def reset_outputs() -> None:
-    """Forget the output files of the command before."""
+    """Clear the list of output files, which are those of a previous command in this process."""
     _outputs.clear()
     _stores.clear()
 
 
 def resumable_store(path: Path) -> None:
-    """Note a store to which chunks are written as they are computed."""
+    """Register a store, to which chunks are written as they are computed."""
     _stores.append(path)
 
 
 def check_suffix(text: str, *suffixes: str, what: str) -> None:
     """UsageError for a name with the suffix of a format that the command does not write.
 
-    What follows a dot and does not begin with a letter (``run_0.5``) is part of the name.
+    A suffix that does not begin with a letter (``run_0.5``) is part of the name.
     """
     suffix = Path(text).suffix
     if re.fullmatch(r"\.[A-Za-z]\w*", suffix) and suffix not in suffixes:
@@ -318,15 +318,15 @@ def check_suffix(text: str, *suffixes: str, what: str) -> None:
 
 
 def output_stem(text: str, *suffixes: str, what: str) -> str:
-    """The name without one of the suffixes, of files that differ in them. Raises as above."""
+    """The common name of files that differ in their ``suffixes``. Raises as ``check_suffix``."""
     check_suffix(text, *suffixes, what=what)
     return text.removesuffix(Path(text).suffix) if Path(text).suffix in suffixes else text
 
 
 def output_path(path: Path | str, suffix: str, *, force: bool, confined: bool = False) -> Path:
-    """The file to write; its folder is made. Raises OSError before the work rather than after it.
+    """The file to write, whose folder is created; raises OSError before the computation if needed.
 
-    An existing file that polhode did not write, and a link, are replaced only by `force`.
+    An existing file that polhode did not write, and a link, are replaced only with `force`.
     `confined`: a name from a scene file, which must not lead out of the current folder.
     """
     text = os.fspath(path)
@@ -371,7 +371,7 @@ def output_path(path: Path | str, suffix: str, *, force: bool, confined: bool = 
 
 
 def state_of_outputs() -> str:
-    """What an interrupted command has written, in words."""
+    """A description of the files that an interrupted command has written."""
     if _stores:
         return "the same command finishes what is missing"
     written, unchanged = ([escape(str(path)) for path in paths] for paths in written_outputs())
@@ -382,13 +382,13 @@ def state_of_outputs() -> str:
 
 
 def written_outputs() -> tuple[list[Path], list[Path]]:
-    """The output files that are new or replaced, and those that are as they were."""
+    """The output files that are new or replaced, and those that are unchanged."""
     new = [path for path, previous in _outputs.items() if _identity(path) != previous]
     return new, [path for path in _outputs if path not in new]
 
 
 def write_figure(path: Path, draw: Callable[[], Any]) -> Path:
-    """Draw without a display and write a PNG, whole or not at all."""
+    """Draw a figure without a display and write it atomically as PNG."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -414,7 +414,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 _MAKER = re.compile(rb'polhode(\W{1,5}\d+\.\d|">)')
-"""How files of polhode name their maker: with its version, or as the generator of a page."""
+"""Pattern by which files of polhode name it: with a version, or as the generator of a page."""
 
 
 def _is_replaceable(path: Path) -> bool:

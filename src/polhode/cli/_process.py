@@ -1,9 +1,9 @@
-"""What a command changes in its process while it runs: signals, the cache of programs, progress.
+"""Process-wide settings of a command: signal handlers, the cache of compiled programs, progress.
 
-Python delivers a signal as an exception in whatever code runs at that moment. If that is a callback
-of a library (such as the one of JAX after a garbage collection), the exception is printed and
-dropped. Every signal is therefore recorded, and ``check_signals`` raises it again between pieces of
-the work.
+A signal handler raises its exception in whatever code runs at that moment. If that is a callback of
+a library (such as the one of JAX after a garbage collection), the exception is printed and
+discarded. Signals are therefore recorded as well, and ``check_signals``, called between the stages
+of a command, raises the exception again.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ _OFF = ("off", "0", "no", "false", "")
 
 @contextlib.contextmanager
 def signal_handlers() -> Iterator[None]:
-    """Let both signals unwind like an exception, so that temporary files are removed."""
+    """SIGINT and SIGTERM raise exceptions in the block, so that temporary files are removed."""
     _received.clear()
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -42,29 +42,30 @@ def signal_handlers() -> Iterator[None]:
 
     alarm = getattr(signal, "SIGALRM", None)  # not on Windows
     watched = [signal.SIGTERM]
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not of a background job
+    # not in a background job of a shell, which ignores SIGINT
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         watched.append(signal.SIGINT)
     previous: dict[int | None, Any] = {n: signal.signal(n, stop) for n in watched}
     try:
         yield
         check_signals()
     except Exception:
-        check_signals()  # a library may have turned the interrupt into an error of its own
+        check_signals()  # a library may have converted the interrupt to another error
         raise
     finally:
-        if alarm in previous:  # a timer of the caller stays as it is
+        if alarm in previous:  # otherwise a timer may belong to the caller
             signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in previous.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
 
 
 _AGAIN = 0.05
-"""[s] After which a signal that came during an import is looked at again."""
+"""Time [s] after which a signal received during an import is handled again."""
 
 
 def _is_importing(frame: types.FrameType | None) -> bool:
-    """Whether a module is being imported: an extension module of jaxlib, left by an exception while
-    it is initialised, aborts the process."""
+    """Whether a module is being imported. An exception during the initialisation of an extension
+    module of jaxlib aborts the process, so that signals must wait."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True
@@ -73,7 +74,7 @@ def _is_importing(frame: types.FrameType | None) -> bool:
 
 
 def check_signals() -> None:
-    """Raise what a signal that came before should have raised."""
+    """Raise the exception of a signal received earlier, in case a library has discarded it."""
     if signal.SIGTERM in _received:
         raise SystemExit(TERMINATED)
     if _received:
@@ -82,11 +83,11 @@ def check_signals() -> None:
 
 @contextlib.contextmanager
 def program_cache(enabled: bool) -> Iterator[None]:
-    """Have JAX store the programs that it compiles in the block, in the user's cache folder.
+    """Use JAX's persistent compilation cache in the block, in the user's cache folder.
 
-    Off when `enabled` is false or POLHODE_CACHE is "off"; that variable may also name the folder. A
-    folder that JAX was given by its own settings stays. What cannot be read or written is compiled
-    again without a word, and a damaged entry is removed.
+    Off if `enabled` is false or POLHODE_CACHE is "off"; that variable may also name the folder. A
+    folder in JAX's own settings has precedence. Entries that cannot be read or written are ignored
+    silently; after a damaged entry the cache is cleared.
     """
     import jax
 
@@ -94,7 +95,7 @@ def program_cache(enabled: bool) -> Iterator[None]:
     if not enabled or (name is not None and name.lower() in _OFF):
         yield
         return
-    # JAX adds its settings when it runs, which its types do not tell
+    # JAX defines this attribute at run time; its type stubs lack it
     own_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     folder = None if own_folder else _folder(name)
     settings = {}
@@ -128,7 +129,7 @@ def program_cache(enabled: bool) -> Iterator[None]:
 
 
 def _set(settings: dict[str, Any]) -> None:
-    """JAX looks at its settings when it first compiles, so it has to look again."""
+    """Update settings of JAX; it reads those of the cache only once, so the cache is reset."""
     import jax
     from jax.experimental.compilation_cache import compilation_cache
 
@@ -139,7 +140,10 @@ def _set(settings: dict[str, Any]) -> None:
 
 
 def _folder(name: str | None) -> Path | None:
-    """The folder of this kind of processor (programs hold its instructions), made; None: none."""
+    """The cache folder, created if needed, or None if it is not writable.
+
+    Its name depends on the CPU features, because compiled programs use their instructions.
+    """
     try:
         if name is None:
             import platformdirs
@@ -165,7 +169,7 @@ def _processor() -> str:
 
 
 def progress_console(quiet: bool) -> Any:
-    """The console for progress, which is for people who watch: nothing goes into a log file."""
+    """The console for progress displays, quiet unless stderr is a terminal."""
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -174,7 +178,7 @@ def progress_console(quiet: bool) -> Any:
 
 
 def progress_bar(console: Any, last: Any) -> Any:
-    """A bar of bodies done, with the column ``last`` at its end."""
+    """A progress bar of the bodies, with ``last`` as its last column."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     columns = TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TextColumn("bodies")
@@ -183,7 +187,7 @@ def progress_bar(console: Any, last: Any) -> Any:
 
 @contextlib.contextmanager
 def spinner(console: Any, words: str) -> Iterator[Callable[[str], None]]:
-    """Show what is done and the time that it has taken; what is yielded changes the words."""
+    """Show the current stage and the elapsed time; yields a function that changes the text."""
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()

@@ -1,6 +1,6 @@
 """`polhode run SCENE`: simulate a scene file, write NetCDF and a figure, print a summary.
 
-A scene with an [ensemble] goes into a Zarr store, chunk by chunk.
+A scene with an [ensemble] is written to a Zarr store in chunks.
 """
 
 import datetime
@@ -46,7 +46,7 @@ def _ensemble_option(name: str, metavar: str, words: str, parser: Any = None) ->
 
 MemoryOption = Annotated[
     int | None,
-    _ensemble_option("--memory", "SIZE", "memory to stay within, such as 2GB", byte_count),
+    _ensemble_option("--memory", "SIZE", "limit of memory, such as 2GB", byte_count),
 ]
 ChunkOption = Annotated[
     int | None,
@@ -102,8 +102,8 @@ def run(
     scheduler: SchedulerOption = None,
 ) -> int:
     """Simulate a scene with its Monte Carlo clones. Writes a NetCDF file and a PNG figure beside
-    it, each complete or not at all, and prints a summary table. A scene with an [ensemble] goes
-    into a Zarr store instead.
+    it, each atomically, and prints a summary table. A scene with an [ensemble] is written to a Zarr
+    store instead.
     """
     file = read_scene(scene, clones, seed)
     options = dict(memory=memory, chunk=chunk, devices=devices, part=part, scheduler=scheduler)  # noqa: C408
@@ -170,12 +170,12 @@ def _with_progress(console, job):
         return _job.run(job, advance)
 
 
-# units of moments, and of what grows with them, where only ratios of moments are known
+# units of quantities proportional to the moments if these are relative
 _RELATIVE = {"energy": "s-2", "momentum_space": "s-1", "work": "s-2"}
 
 
 def _dataset(job, outcome, figures, precision: str, figure: bool):
-    """The trajectory's dataset with the clones numbered, their periods and what was run."""
+    """The trajectory's dataset with clone numbers, periods, event times, moments and provenance."""
     from polhode.cli import _job
 
     dataset = outcome.trajectory.to_xarray()
@@ -215,7 +215,7 @@ def _dataset(job, outcome, figures, precision: str, figure: bool):
 
 
 def _provenance(job, precision: str, figure: bool) -> dict[str, Any]:
-    """What was run, as attributes: the scene as read, options in force, seed, versions, commit."""
+    """Attributes that document the run: scene text, effective options, seed, versions, commit."""
     import jax
     import numpy as np
 
@@ -256,7 +256,7 @@ def _provenance(job, precision: str, figure: bool) -> dict[str, Any]:
 
 
 def _texts(file) -> dict[str, str]:
-    """What the scene file says, as attributes."""
+    """Attributes from the scene file."""
     return {
         "title": escape(file.title),
         "scene_source": escape(file.source),
@@ -319,7 +319,7 @@ def _run_ensemble(
     quiet: bool,
     no_cache: bool,
 ) -> int:
-    """Compute the ensemble into its store; 0, or 1 when some bodies did not finish."""
+    """Compute the ensemble into its store. Returns 0, or 1 if some bodies did not finish."""
     console = _process.progress_console(quiet)
     path = _store_path(file, output)
     with _process.spinner(console, "starting"):
@@ -340,7 +340,7 @@ def _run_ensemble(
             last = _stream(file, ensemble, statistics, path, precision, meter, options)
     except StoreError:
         raise
-    except ValueError as error:  # of sizes, which options gave
+    except ValueError as error:  # for example of sizes from options
         raise UsageError(str(error)) from error
     if not quiet:
         rate = "nothing was missing" if last.rate is None else f"{last.rate:,.0f} bodies/s"
@@ -403,7 +403,7 @@ def _devices(count: str) -> list[Any]:
 
 
 class _Meter:
-    """Progress with rate and remaining time, for people who watch; remembers the last report."""
+    """Progress display with rate and remaining time; ``last`` is the last report."""
 
     def __init__(self, console):
         from rich.progress import TextColumn

@@ -1,4 +1,4 @@
-"""Ensembles of any size: drawn by index, written chunk by chunk, resumed after a kill."""
+"""Ensembles of any size: drawn by index, written in chunks, resumed after an interruption."""
 
 from polhode.ensemble._ensemble import (
     AnyAttitude as AnyAttitude,

@@ -1,8 +1,8 @@
-"""Ensembles: any number of bodies, each drawn from its own index, never all in memory.
+"""Ensembles: any number of bodies, each drawn by its index, never all in memory at once.
 
-The bodies differ from a nominal one by spreads, each of which changes one thing. A spread is any
-callable ``(key, scene, state) -> (scene, state)`` of one body; those here cover what scene files
-can say.
+The bodies differ from a nominal one by spreads, each of which changes one quantity. A spread is any
+callable ``(key, scene, state) -> (scene, state)`` of one body; this module has those that scene
+files support.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ _MAX_DRAWS = 100
 Spread = Callable[[Array, Scene, State], tuple[Scene, State]]
 
 ROWS = {"moments": 3, "wxyz": 4, "omega_body": 3, "momentum_body": 3, "torque": 3}
-"""What ``Ensemble.rows`` may give for each body, and how many numbers."""
+"""Quantities that ``Ensemble.rows`` may contain, and their number of components."""
 
 
 class Ensemble(eqx.Module):
@@ -42,10 +42,10 @@ class Ensemble(eqx.Module):
     **Arguments:** ``scene``, ``state``: the nominal body, or arrays with one leading axis of
     length ``bodies`` in any leaf (the others are shared); ``bodies``; ``spreads``: callables
     ``(key, scene, state) -> (scene, state)`` of one body, applied in order; ``seed``; ``rows``:
-    NumPy arrays (bodies, ...) that stay where they are, for example on disk
-    (``np.load(file, mmap_mode="r")``), of which each chunk reads its part: ``moments``, ``wxyz``,
-    ``omega_body``, ``momentum_body`` or ``torque`` (of a constant torque) in place of the nominal
-    ones, before the spreads; the momentum after them.
+    NumPy arrays (bodies, ...) of which each chunk reads its part, so that they may remain on disk
+    (``np.load(file, mmap_mode="r")``): ``moments``, ``wxyz``, ``omega_body``, ``momentum_body`` or
+    ``torque`` (of a constant torque). They replace the nominal ones before the spreads, the
+    momentum after them.
 
     Body i depends on the seed and on i alone (its key is the seed's with i folded in, and each
     kind of spread has its own stream), so that no result depends on how the bodies are grouped.
@@ -93,7 +93,7 @@ class Ensemble(eqx.Module):
             constant_torque(self.scene)
 
     def lanes(self, indices: np.ndarray) -> tuple[Any, Any]:
-        """What ``draw`` needs of the bodies ``indices``: (leaves cut to them, shared leaves)."""
+        """Arguments of ``draw`` for ``indices``: (leaves and rows of the bodies, shared leaves)."""
         parts = (self.scene, self.state)
         lane_parts, shared = eqx.partition(parts, is_lane_tree(parts))
         dtype = self.state.wxyz.dtype
@@ -110,7 +110,7 @@ class Ensemble(eqx.Module):
 def draw(
     lane_parts: Any, shared: Any, indices: Array, spreads: Any, seed: Array
 ) -> tuple[Scene, State]:
-    """The bodies of the indices (n,) of uint32 and a seed of uint32; traceable."""
+    """Scenes and states of the bodies ``indices`` (n,), uint32, for a uint32 seed; traceable."""
     root = jax.random.key(seed, impl="threefry2x32")
 
     def draw_one(index, leaves_and_rows) -> tuple[Any, Any]:
@@ -122,7 +122,7 @@ def draw(
         for spread in spreads:
             stream = stream_of(spread)
             spread_key = jax.random.fold_in(key, stream)
-            if stream in streams:  # spreads of one name draw independently
+            if stream in streams:  # several spreads of one name must draw independently
                 spread_key = jax.random.fold_in(spread_key, streams.count(stream))
             streams.append(stream)
             scene, state = spread(spread_key, scene, state)
@@ -130,7 +130,7 @@ def draw(
             state = _with_momentum(scene, state, rows["momentum_body"])
         return eqx.partition((scene, state), _may_differ((scene, state)))
 
-    axes = (eqx.if_array(0), None)  # what all bodies share has no axis of bodies
+    axes = (eqx.if_array(0), None)  # leaves that all bodies share have no axis of bodies
     try:
         drawn = eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=axes)(
             indices, lane_parts
@@ -152,7 +152,7 @@ def _may_differ(parts: Any) -> Any:
 
 
 def _replace_rows(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scene, State]:
-    """One body with its rows in place of the nominal numbers."""
+    """One body with its rows in place of the nominal values."""
     if "moments" in rows:
         scene = _with_moments(scene, rows["moments"])
     if "torque" in rows:
@@ -170,7 +170,8 @@ def _with_moments(scene: Scene, moments: Array) -> Scene:
 
 
 def _with_momentum(scene: Scene, state: State, momentum: Array) -> State:
-    _ = scene.constant_inertia  # refuses one that changes, as the first time is not known here
+    # raises for an inertia that varies with time: the initial time is not known here
+    _ = scene.constant_inertia
     return scene.with_momentum(state, momentum)
 
 
@@ -189,10 +190,9 @@ class Deviate(eqx.Module):
 
 
 class SpreadMoments(eqx.Module):
-    """Principal moments times (1 + deviate), about the same axes; draws that no body can have are
-    drawn again.
+    """Principal moments times (1 + deviate), about the same axes; unphysical draws are repeated.
 
-    After 100 impossible draws the moments become NaN, and the status of the body says so.
+    After 100 unphysical draws the moments become NaN, which the status of the body reports.
     """
 
     relative: Deviate
@@ -231,7 +231,7 @@ class SpreadAttitude(eqx.Module):
 
 
 class AnyAttitude(eqx.Module):
-    """Attitudes spread evenly over all rotations."""
+    """Attitudes distributed uniformly over all rotations."""
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         wxyz = jax.random.normal(key, (4,), state.wxyz.dtype)
@@ -239,7 +239,7 @@ class AnyAttitude(eqx.Module):
 
 
 class SpreadEuler(eqx.Module):
-    """Euler ``angles`` (3,) [rad] of a sequence, each with its deviate [rad]."""
+    """Euler ``angles`` (3,) [rad] of a sequence, each plus its deviate [rad]."""
 
     angles: Float[Array, " 3"]
     deviate: Deviate
@@ -261,8 +261,8 @@ class SpreadRates(eqx.Module):
 
 
 class SpreadMomentum(eqx.Module):
-    """Body momentum ``momentum`` (3,) [kg m^2/s], that of wheels included, plus a deviate: rates
-    follow from the inertia that the spreads before this one left.
+    """Body momentum ``momentum`` (3,) [kg m^2/s], wheels included, plus a deviate. The rates follow
+    from the inertia after the preceding spreads.
     """
 
     momentum: Float[Array, " 3"]
@@ -283,7 +283,7 @@ class SpreadTorque(eqx.Module):
 
 
 def constant_torque(scene: Scene) -> Array:
-    """The numbers of the one constant torque of a scene [N m]. Raises TypeError without one."""
+    """The constant torque of a scene [N m]. Raises TypeError unless the scene has exactly one."""
     torque = scene.torque
     is_of_kind = isinstance(torque, BodyTorque | SpaceTorque)
     if not is_of_kind or not isinstance(torque.n, Array):
@@ -302,16 +302,16 @@ def with_torque(scene: Scene, n: Array) -> Scene:
 
 
 def stream_of(spread: Any) -> int:
-    """The number of a spread's own stream of random numbers, from its name: adding one spread
-    leaves the draws of the others as they are.
+    """The number of a spread's own stream of random numbers, from its name: adding a spread does
+    not change the draws of the others.
     """
     name = getattr(spread, "__name__", type(spread).__name__)
     return zlib.crc32(name.encode())
 
 
 def build_ensemble(file: "SceneFile", dtype: DTypeLike) -> tuple[Ensemble, tuple[Statistic, ...]]:
-    """The ensemble and the statistics to keep. Raises SceneFileError for impossible numbers and
-    ValueError for a file without [ensemble].
+    """The ensemble and the statistics of a scene file. Raises SceneFileError for impossible numbers
+    and ValueError for a file without [ensemble].
     """
     from polhode.files import build_inertia, build_scene, build_state
 

@@ -1,4 +1,4 @@
-"""Statistics over the bodies of an ensemble at each time, stored instead of trajectories."""
+"""Statistics over the bodies of an ensemble at each time, with or instead of trajectories."""
 
 import dataclasses
 from collections.abc import Callable
@@ -19,10 +19,10 @@ SUMMARY_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 class Statistic:
     """One quantity whose distribution over the bodies is computed at every time.
 
-    ``quantity(trajectory)`` gives (bodies, T). Mean, standard deviation, minimum and maximum are
+    ``quantity(trajectory)`` returns (bodies, T). Mean, standard deviation, minimum and maximum are
     always computed; with ``low < high`` also a histogram of ``bins`` equal bins between them (and
-    what lies outside), from which quantiles follow to within a bin. Bodies that did not finish do
-    not count. Raises ValueError for a range or number of bins that makes no histogram.
+    two for values outside), which gives quantiles to within a bin. Bodies that did not finish are
+    not counted. Raises ValueError for an invalid range or number of bins.
     """
 
     name: str
@@ -69,7 +69,7 @@ def energy(trajectory: Trajectory) -> Array:
 
 
 def momentum(trajectory: Trajectory) -> Array:
-    """Size of the angular momentum [kg m^2/s]."""
+    """Magnitude of the angular momentum [kg m^2/s]."""
     return jnp.linalg.norm(trajectory.momentum_body, axis=-1)
 
 
@@ -79,12 +79,14 @@ QUANTITIES = {
     "energy": (energy, "J"),
     "momentum": (momentum, "kg m2 s-1"),
 }
-"""What scene files can name: quantity and units."""
+"""Quantities that scene files can name, with their units."""
 
 
 def summarise(statistic: Statistic, trajectory: Trajectory, is_body: Bool[Array, " n"]) -> dict:
-    """Count, mean, sum of squared deviations, extremes and histogram of the bodies of a block that
-    exist (``is_body``) and finished; arrays (T,), the histogram (T, bins + 2) with both outsides.
+    """Count, mean, sum of squared deviations, extremes and histogram of a block, as arrays (T,).
+
+    Only bodies that exist (``is_body``, not padding) and finished are counted. The histogram
+    (T, bins + 2) starts with the values below the range and ends with those above it.
     """
     values: Float[Array, "n t"] = statistic.quantity(trajectory)
     counted = (is_body & trajectory.successful)[:, None] & jnp.isfinite(values)
@@ -101,7 +103,7 @@ def summarise(statistic: Statistic, trajectory: Trajectory, is_body: Bool[Array,
     if statistic.low is not None:
         edges = jnp.asarray(statistic.edges, values.dtype)
         place = jnp.searchsorted(edges, values, side="right")
-        place = jnp.where(values == edges[-1], statistic.bins, place)  # the last bin holds its end
+        place = jnp.where(values == edges[-1], statistic.bins, place)  # the last bin is closed
         place = jnp.where(counted, place, 0)
         columns = jnp.broadcast_to(jnp.arange(values.shape[1])[None], values.shape)
         empty = jnp.zeros((values.shape[1], statistic.bins + 2), jnp.int32)
@@ -121,8 +123,9 @@ class Moments(NamedTuple):
         return cls(np.zeros(times), np.zeros(times), np.zeros(times))
 
     def add(self, count: np.ndarray, mean: np.ndarray, squares: np.ndarray) -> "Moments":
-        """With those of further blocks (blocks, T), block after block, so that the result does not
-        depend on how blocks form chunks (Chan et al. 1979).
+        """The moments after adding those of further blocks (blocks, T) by Chan et al. (1979).
+
+        Blocks are added one by one, so that the result does not depend on the size of the chunks.
         """
         total, average, spread = self
         for n, m, s in zip(count.astype(float), mean.astype(float), squares.astype(float)):
@@ -135,8 +138,9 @@ class Moments(NamedTuple):
 
 
 def quantile(histogram: np.ndarray, edges: np.ndarray, q: float) -> np.ndarray:
-    """The q-quantile at each time from histograms (T, bins + 2), linear within a bin; NaN where it
-    lies outside the edges or nothing was counted.
+    """The q-quantile at each time from histograms (T, bins + 2), linear within a bin.
+
+    NaN where it lies outside the edges or the histogram is empty.
     """
     sums = np.cumsum(histogram, axis=-1, dtype=float)
     out = np.full(len(sums), np.nan)
@@ -150,8 +154,8 @@ def quantile(histogram: np.ndarray, edges: np.ndarray, q: float) -> np.ndarray:
 
 
 def write_summaries(store: Store, statistics: tuple[Statistic, ...]) -> None:
-    """Write NAME_summary_mean, _std, _min, _max (time) and, with a histogram, its sum over the
-    bodies, its edges and quantiles. Every call writes the same numbers.
+    """Write NAME_summary_count, _mean, _std, _min, _max (time) and, with a histogram, its sum over
+    the chunks, its edges and quantiles. Every call writes the same numbers.
     """
     for s in statistics:
         name = s.name

@@ -1,8 +1,8 @@
 """The Zarr store of an ensemble: one file per chunk and array, written atomically by Zarr.
 
-A chunk is complete when the file of every array is there and can be decoded; crc32c finds files
-that were altered or cut. Nothing else is recorded, so that any number of processes can write to a
-store without locks: they write different files, or the same bytes.
+A chunk is complete when the file of every array exists and can be decoded; crc32c detects files
+that were altered or truncated. Nothing else is recorded, so that any number of processes can write
+to a store without locks: they write different files, or the same bytes.
 """
 
 import contextlib
@@ -34,18 +34,18 @@ if TYPE_CHECKING:
 
 
 _LIBRARIES = ("polhode", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
-_DIGEST_BYTES = 2**24  # of an array that are read at a time
+_DIGEST_BYTES = 2**24  # bytes of an array that ``digest`` reads at a time
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be used: of another run, damaged, incomplete, or on a full disk."""
+    """Raised for an unusable store: of another run, damaged, incomplete, or on a full disk."""
 
 
 def open_store(path: str | os.PathLike) -> "xarray.Dataset":
     """The stored ensemble at ``path`` as an xarray dataset, which is read lazily.
 
-    Raises StoreError for a store whose chunks or statistics are not complete, which names the
-    missing chunks; ``xarray.open_zarr`` reads such a store, with NaN and status 255 in their place.
+    Raises StoreError for a store whose chunks or statistics are not complete; the message names the
+    missing chunks. ``xarray.open_zarr`` reads such a store, with NaN and status 255 in their place.
     """
     path = Path(path)
     if words := missing_chunks(path):
@@ -71,7 +71,7 @@ class Field(NamedTuple):
 
     @property
     def fill_value(self) -> Any:
-        """A value that no result has."""
+        """A value that no result can have; it stands for chunks not yet written."""
         if self.dtype == np.uint8:
             return 255
         return np.nan if np.issubdtype(self.dtype, np.floating) else -1
@@ -129,8 +129,8 @@ def create(
     attributes: Mapping[str, Any],
     identity: Mapping[str, Any],
 ) -> None:
-    """Make an empty store in a temporary folder and rename it. Where another process was faster,
-    its store stays.
+    """Create an empty store in a temporary folder and rename it. If another process has created the
+    store in the meantime, that one is used.
     """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.partial")
     try:
@@ -139,7 +139,7 @@ def create(
         _write_empty(temporary, ts, layout, metadata)
         try:
             os.rename(temporary, path)
-        except OSError as error:  # a rename does not replace a folder that is not empty
+        except OSError as error:  # ``rename`` does not replace a folder that is not empty
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
     except OSError as error:
@@ -153,8 +153,8 @@ def create(
 def compare_identity(
     path: Path, identity: Mapping[str, Any], attributes: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The identity of a store that belongs to this run. Raises StoreError, which names what
-    differs, for a store of another run, and for a folder that is no store.
+    """The identity of a store that belongs to this run. Raises StoreError with the differences for
+    a store of another run, and for a folder that is not a store.
     """
     stored = _read_identity(path)
     texts = _read_json(path, "zarr.json")["attributes"]
@@ -184,8 +184,8 @@ def _first_difference(stored: str, text: str) -> str:
 
 
 class Store:
-    """The store of a run, opened for writing. Raises StoreError, and leaves the folder as it is,
-    when its metadata are not those that the store was created with.
+    """The store of a run, opened for writing. Raises StoreError, without changing the folder, if
+    its metadata differ from those at its creation.
     """
 
     def __init__(self, path: Path, ts: np.ndarray, layout: Mapping[str, Field]):
@@ -193,14 +193,14 @@ class Store:
         self.chunks = -(-layout["status"].shape[0] // layout["status"].rows)
         self._compare_metadata(ts)
         zarr = _zarr()
-        # chunks that equal the fill value are written too: a chunk without a file is missing
+        # Zarr must write chunks that equal the fill value too: without a file a chunk is missing.
         with zarr.config.set({"array.write_empty_chunks": True}):
             self.group = zarr.open_group(path, mode="r+", use_consolidated=False)
             self.arrays = {name: self.group[name] for name in layout}
         self._check_times(ts)
 
     def _compare_metadata(self, ts: np.ndarray) -> None:
-        """Compare every zarr.json with the one that the store was created with."""
+        """Compare every zarr.json with the one that a new store of this run would have."""
         files: dict[str, Any] = {}
         _write_empty(_zarr().storage.MemoryStore(files), ts, self.layout, {})
         root = json.loads(files.pop("zarr.json").to_bytes())
@@ -211,7 +211,7 @@ class Store:
         }
         for key, document in documents.items():
             _require_equal(self.path, key, _read_json(self.path, key), document)
-        # statistics are added later
+        # only the arrays of the layout are compared: those of ``put`` are added later
         stored = _dictionary(_read_json(self.path, "zarr.json")).get("consolidated_metadata")
         consolidated = _dictionary(_dictionary(stored).get("metadata"))
         for name, document in root["consolidated_metadata"]["metadata"].items():
@@ -219,10 +219,10 @@ class Store:
             _require_equal(self.path, key, consolidated.get(name), document)
 
     def _check_times(self, ts: np.ndarray) -> None:
-        """Write the times again where they are missing or damaged."""
+        """Write the times again if they are missing or damaged."""
         try:
             same = np.array_equal(self.group["time"][:], ts)
-        except Exception:  # a damaged file fails in whichever codec reads it first
+        except Exception:  # the type of the error depends on the codec that fails first
             same = False
         if not same:
             shutil.rmtree(self.path / "time" / "c", ignore_errors=True)
@@ -243,26 +243,26 @@ class Store:
         return self.arrays[name][self.layout[name].region(k)]
 
     def is_complete(self, k: int) -> bool:
-        """Whether chunk ``k`` is there and can be decoded."""
+        """Whether the files of chunk ``k`` exist and can be decoded."""
         try:
             if not all(self.file(name, k).is_file() for name in self.layout):
                 return False
             for name in self.layout:
                 self.read(name, k)
             return True
-        except Exception:  # a damaged file fails in whichever codec reads it first
+        except Exception:  # the type of the error depends on the codec that fails first
             return False
 
     def write(self, k: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write chunk ``k``: one file of each array, in place of what is there."""
+        """Write chunk ``k``, one file of each array, replacing any existing files."""
         with self._write_errors():
             for name, field in self.layout.items():
-                # a damaged file of the last chunk would be decoded to fill it up
+                # Zarr would decode the file of a last chunk that is not full, which may be damaged.
                 self.file(name, k).unlink(missing_ok=True)
                 self.arrays[name][field.region(k)] = arrays[name]
 
     def remove_partial(self) -> None:
-        """Remove what killed processes left half-written: others may still write theirs."""
+        """Remove partial files of killed processes, but not those that others may still write."""
         for file in self.path.rglob("*.partial"):
             if _is_abandoned(file):
                 file.unlink(missing_ok=True)
@@ -284,7 +284,7 @@ class Store:
             raise StoreError(f"cannot write to {self.path}: {reason(error)}.") from error
 
     def put(self, name: str, values: np.ndarray, dimensions: tuple, units: str) -> None:
-        """Write a small array as a whole."""
+        """Write a small array in one chunk."""
         zarr = _zarr()
 
         def make(group, overwrite=False):
@@ -299,8 +299,8 @@ class Store:
                 overwrite=overwrite,
             )
 
-        # An array that is there and sound is kept and its one file replaced: another process may
-        # write the same to it at the same time.
+        # The metadata of an undamaged array are not rewritten, only the file of its single chunk:
+        # another process may write the same values to it at the same time.
         expected = make(zarr.create_group(zarr.storage.MemoryStore())).metadata
         with self._write_errors():
             if not (self.path / name / "zarr.json").exists():
@@ -309,20 +309,20 @@ class Store:
             try:
                 array = self.group[name]
                 is_sound = array.metadata == expected
-            except Exception:  # damaged: its description is read by several libraries
+            except Exception:  # damaged metadata: the type of the error depends on the library
                 is_sound = False
             if not is_sound:
                 array = make(self.group, overwrite=True)
             array[...] = values
 
     def consolidate(self) -> None:
-        """Gather the metadata of all arrays in one file, which xarray reads first."""
+        """Consolidate the metadata of all arrays in one file, which xarray reads first."""
         with self._write_errors():
             _consolidate(self.path)
 
 
 _ABANDONED = 600.0
-"""[s] Without a change, after which what is half-written belongs to no process any more."""
+"""Time without change [s] after which a partial file is regarded as abandoned by its process."""
 
 
 def _is_abandoned(path: Path) -> bool:
@@ -333,14 +333,14 @@ def _is_abandoned(path: Path) -> bool:
 
 
 def plain_number(x: Any) -> Any:
-    """A number of NumPy or JAX as one of Python, which JSON can hold; anything else as it is."""
+    """A scalar of NumPy or JAX as a Python number, which JSON supports; other values unchanged."""
     return x.item() if getattr(x, "shape", None) == () else x
 
 
 def digest(*values: Any) -> str:
     """A SHA-256 of the structure, the static fields and the numbers of the values.
 
-    Functions count by their name: their code and what it refers to do not.
+    Functions are represented by their names, not by their code or the objects it refers to.
     """
     structure = re.sub(" at 0x[0-9a-f]+", "", eqx.tree_pformat(values, short_arrays=True))
     sha = hashlib.sha256(structure.encode())
@@ -363,8 +363,8 @@ def digest(*values: Any) -> str:
 
 
 def has_user_code(x: Any) -> bool:
-    """Whether a value contains a function or a class that is neither of polhode nor of a library
-    it is built on, so that its structure and its numbers do not say what it computes.
+    """Whether a value contains a function or a class from outside polhode and its libraries, so
+    that ``digest`` does not determine what it computes.
     """
     if isinstance(x, tuple | list):
         return any(map(has_user_code, x))
@@ -380,13 +380,13 @@ def has_user_code(x: Any) -> bool:
 
 def _is_foreign(x: Any) -> bool:
     module = getattr(x, "__module__", None) or ""
-    # a lambda or an inner function of a library may contain anything
+    # a lambda or inner function of polhode may refer to objects of the user
     inner = "<locals>" in getattr(x, "__qualname__", "<locals>")
     return module.partition(".")[0] not in _LIBRARIES or (inner and module.startswith("polhode"))
 
 
 def versions() -> dict[str, str]:
-    """The versions that decide the bits of a result."""
+    """The versions on which the bits of a result depend."""
     import diffrax
 
     from polhode import __version__
@@ -400,7 +400,7 @@ def versions() -> dict[str, str]:
 
 
 def missing_chunks(path: Path) -> str:
-    """Which chunks of a store are missing, in words; empty when none is."""
+    """A description of the missing chunks of a store; empty when none is missing."""
     identity = _read_identity(path)
     dimensions = {}
     for name in identity["arrays"]:
@@ -421,7 +421,7 @@ def missing_chunks(path: Path) -> str:
 
 
 def _missing(path: Path, dimensions: Mapping[str, int], chunks: int) -> list[int]:
-    """The chunks of which the file of an array is missing."""
+    """The chunks for which the file of at least one array is missing."""
     return [
         k
         for k in range(chunks)
@@ -462,7 +462,7 @@ def _write_empty(
 
 def _consolidate(store: Any) -> None:
     with warnings.catch_warnings():
-        # Zarr warns that version 3 of its specification does not have this yet
+        # Zarr warns that consolidated metadata are not yet part of specification version 3
         warnings.simplefilter("ignore", UserWarning)
         _zarr().consolidate_metadata(store, zarr_format=3)
 
@@ -486,7 +486,7 @@ def _dictionary(x: Any) -> dict:
 
 
 def _require_equal(path: Path, key: str, stored: Any, expected: Any) -> None:
-    """Raise StoreError that names the first entry that differs."""
+    """Raise StoreError with the first entry that differs."""
     if stored == expected:
         return
     stored, name = _dictionary(stored), "its content"
@@ -500,7 +500,7 @@ def _require_equal(path: Path, key: str, stored: Any, expected: Any) -> None:
 
 
 def _read_identity(path: Path) -> dict[str, Any]:
-    """The identity of the run that a store belongs to."""
+    """The identity of the run to which a store belongs, from its metadata. Raises StoreError."""
     text = _dictionary(_dictionary(_read_json(path, "zarr.json")).get("attributes")).get("polhode")
     try:
         identity = json.loads(text)

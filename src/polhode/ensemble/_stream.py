@@ -1,9 +1,10 @@
-"""Run an ensemble into a store, in chunks made of blocks, here or on a dask cluster; continue it.
+"""Simulation of an ensemble into a store, in this process or on a dask cluster; it can be resumed.
 
-Vectorised loops treat the last lanes of an array differently from the others, and adaptive solvers
-share steps within a group of lanes. The result of a body therefore depends on its place in the
-compiled block. The size of a block depends on the number of samples alone, and body i always stands
-at place i modulo that size, so chunk size, number of devices and number of processes change no bit.
+Bodies are computed in blocks, and chunks consist of blocks. Vectorised loops treat the last lanes
+of an array differently from the others, and adaptive solvers share steps within a group of lanes.
+The result of a body therefore depends on its place in the compiled block. The size of a block
+depends on the number of samples alone, and body i is always at place i modulo that size, so that
+chunk size, number of devices and number of processes do not change any bit of the results.
 """
 
 import collections
@@ -58,9 +59,9 @@ def block_size(samples: int) -> int:
 
 
 class Block:
-    """``Block(...)(first_body)`` computes the block that starts at this body, and returns
-    device arrays by name. Blocks go to the devices in turn, each by the
-    same program of one device: how many devices there are changes no bit.
+    """``Block(...)(first_body)`` computes the block that starts at this body, and returns device
+    arrays by name. Blocks are assigned to the devices in turn, each computed by the same
+    single-device program, so that the results do not depend on the number of devices.
     """
 
     def __init__(
@@ -81,8 +82,8 @@ class Block:
         self.size = block_size(ts.shape[0])
         self.rtol = check_rtol(rtol, ts.dtype)
         if method is None:
-            # by the bodies drawn: those of a symmetric one may have three moments
-            # the arrays of the ensemble are closed over: rows are read by NumPy
+            # The choice depends on drawn bodies, not on the nominal one: spreads may break its
+            # symmetry. ``draw`` is a closure because NumPy reads its rows, which cannot be traced.
             drawn, _ = eqx.filter_eval_shape(lambda: ensemble.draw(np.zeros(1, int)))
             method, _ = choose(drawn, self.rtol)
         self.method = method
@@ -91,7 +92,7 @@ class Block:
         self.compiled: list[Any] = []
 
     def inputs(self, first_body: int) -> tuple:
-        """The arguments of ``program`` for the block from ``first_body`` on, on its device."""
+        """The arguments of ``program``, on its device, for the block starting at ``first_body``."""
         device = self.devices[first_body // self.size % len(self.devices)]
         indices = np.arange(first_body, first_body + self.size)
         lane_parts, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))
@@ -106,8 +107,8 @@ class Block:
         return self.compiled[first_body // self.size % len(self.devices)](*self.inputs(first_body))
 
     def compile(self) -> None:
-        """Compile the program for all devices at the same time. It is traced in the calling thread,
-        whose settings (such as those of ``jax.enable_x64``) apply.
+        """Compile the program for all devices in parallel. Tracing takes place in the calling
+        thread, whose settings (such as ``jax.enable_x64``) apply.
         """
         count = min(len(self.devices), -(-self.ensemble.bodies // self.size))
         lowered = [program.lower(*self.inputs(k * self.size)) for k in range(count)]
@@ -118,7 +119,7 @@ class Block:
 
 
 class Settings(NamedTuple):
-    """What the program is compiled for, beside the shapes."""
+    """The static arguments of ``program``."""
 
     size: int
     trajectories: bool
@@ -129,7 +130,7 @@ class Settings(NamedTuple):
 def program(
     first_body: Array, lane_parts: Any, shared: Any, settings: Settings
 ) -> dict[str, Array]:
-    """One block on one device. Compiled once per kind of run and device."""
+    """One block on one device. Compiled once for each device and combination of static values."""
     shared, spreads, method, ts, rtol, (seed, bodies) = shared
     indices = first_body + jnp.arange(settings.size, dtype=jnp.uint32)
     scene, state = draw(lane_parts, shared, indices, spreads, seed)
@@ -146,8 +147,8 @@ def program(
 def compute(block: Block, layout: Mapping[str, Field], chunk: int, k: int) -> dict[str, np.ndarray]:
     """The arrays of chunk ``k``, the bodies from ``k * chunk`` on, by name.
 
-    Every device computes one block at a time. The result depends on ``k``, the seed and the scene
-    alone: not on the size of the chunk, the number of devices or what was computed before.
+    Every device computes one block at a time. The result of a body depends on its index, the seed
+    and the scene alone: not on the size of the chunk, the number of devices or earlier results.
     """
     first_body, end_body = k * chunk, min((k + 1) * chunk, block.ensemble.bodies)
     arrays = {}
@@ -176,16 +177,16 @@ def compute(block: Block, layout: Mapping[str, Field], chunk: int, k: int) -> di
     return arrays
 
 
-_CHUNK_BYTES = 2**26
-_STATISTICS_BLOCKS = 64  # blocks of a chunk where only statistics are stored
-_PROCESS_BYTES = 600_000_000  # Python, JAX and the compiled program
+_CHUNK_BYTES = 2**26  # target size of a chunk with trajectories, if ``chunk`` is not given
+_STATISTICS_BLOCKS = 64  # blocks of a chunk if only statistics are stored
+_PROCESS_BYTES = 600_000_000  # memory of Python, JAX and the compiled program
 _DEFAULT_MEMORY = 4_000_000_000
-_COPIES = 4  # of a chunk while it is computed, compressed and written
+_COPIES = 4  # copies of a chunk in memory while it is computed, compressed and written
 
 
 class Progress(NamedTuple):
-    """Bodies finished out of those of this run, ``reused`` of them computed earlier; ``rate``
-    bodies/s and ``remaining`` seconds are None before the first chunk is computed.
+    """Progress of a run: ``done`` of ``total`` bodies, ``reused`` of them computed earlier;
+    ``rate`` [bodies/s] and ``remaining`` time [s], None before the first chunk is computed.
     """
 
     done: int
@@ -215,29 +216,30 @@ def stream(
 ) -> Path:
     """Simulate all bodies at the times ``ts`` (T,) [s] into the Zarr store ``path``; returns it.
 
-    The same call again decodes the chunks that are there, computes those that are missing or
-    damaged, and ends with the bits of an undisturbed run. Chunks are separate files, each written
-    atomically, so that any number of processes may write to one store.
+    Repeating the call resumes an interrupted run: it verifies the existing chunks and computes
+    those that are missing or damaged. The resulting store is bit-identical to that of an
+    uninterrupted run. Chunks are separate files, each written atomically, so that any number of
+    processes may write to one store.
 
-    - ``name``: what is computed, in words. Required where the ensemble, the method or a statistic
-      contains functions or classes of your own, whose code is not compared: a store belongs to the
-      run of its name. Numbers, structure, seed, tolerance and versions are always compared.
+    - ``name``: a name of the run, which is compared with that of an existing store. Required where
+      the ensemble, the method or a statistic contains functions or classes of your own, because
+      their code is not compared. Numbers, structure, seed, tolerance and versions always are.
     - ``method``, ``rtol``: as in ``ph.simulate``.
-    - ``trajectories``, ``statistics``: what is stored beside the status of each body.
-    - ``memory``: limit [bytes] from which the size of a chunk follows; ``chunk``: bodies per chunk
-      instead, a multiple of the block (docs/scale.md, Reproducibility). A store retains
-      the chunks it began with.
-    - ``devices``: local JAX devices that share the bodies; None: the first one.
-    - ``part``: (i, n) computes every n-th chunk from the i-th on, i from 1 to n; chunks are then
-      small enough for n parts. The statistics are reduced by the first call without it that finds
-      all chunks.
+    - ``trajectories``, ``statistics``: what is stored in addition to the status of each body.
+    - ``memory``: limit [bytes] that determines the size of a chunk; ``chunk``: bodies per chunk
+      instead, a multiple of the block (docs/scale.md, Reproducibility). The chunk size of an
+      existing store does not change.
+    - ``devices``: local JAX devices among which the bodies are divided; None: the first one.
+    - ``part``: (i, n) computes every n-th chunk starting with the i-th, i from 1 to n; the chunk
+      size then allows n parts. The statistics are reduced by a call without ``part`` after all
+      chunks are complete.
     - ``scheduler``: the address or the ``dask.distributed.Client`` of a cluster that computes the
-      chunks; None: the active client of this process, and without one this process.
-    - ``attributes``: text to store, such as the scene file; compared as well.
+      chunks; None: the active client of this process, or this process if there is none.
+    - ``attributes``: texts to store, such as the scene file; they are compared as well.
     - ``progress``: called after each chunk.
 
     Raises ``polhode.ensemble.StoreError`` for a store of another run, damaged metadata or a full
-    disk, and ValueError for options that do not fit.
+    disk, and ValueError for invalid options.
     """
     path = Path(path).resolve()
     statistics, attributes = tuple(statistics), dict(attributes or {})
@@ -287,7 +289,7 @@ def _check(ensemble, method, name, trajectories, statistics, part) -> None:
 
 
 class Job:
-    """An ensemble, what is stored of it and where: chunk ``k`` is completed by ``complete(k)``."""
+    """An ensemble, its options and its store; ``complete(k)`` computes and writes chunk ``k``."""
 
     def __init__(
         self,
@@ -313,7 +315,7 @@ class Job:
         return make_layout(bodies, chunk, block, self.times, self.trajectories, self.statistics)
 
     def identity(self, name: str | None) -> dict[str, Any]:
-        """What two runs must share to write to one store, as plain JSON; without the chunk."""
+        """The JSON that must be equal for two runs to write to one store; without chunk size."""
         block, ensemble = self.block, self.block.ensemble
         parts = (ensemble.scene, ensemble.state, ensemble.spreads, ensemble.rows)
         return {
@@ -332,15 +334,13 @@ class Job:
         } | versions()
 
     def open(self, chunk: int) -> Store:
-        """Open the store, whose chunks have so many bodies."""
+        """Open the store, whose chunks have ``chunk`` bodies."""
         self.chunk = chunk
         self.store = Store(self.path, self.times, self.layout(chunk))
         return self.store
 
     def complete(self, k: int) -> bool:
-        """Compute and write chunk ``k`` unless it is there and can be decoded; whether it was
-        computed.
-        """
+        """Compute and write chunk ``k`` unless it is complete; returns whether it was computed."""
         assert self.store is not None
         if self.store.is_complete(k):
             return False
@@ -356,8 +356,8 @@ class Sizes(NamedTuple):
 
 
 def chunk_sizes(job: Job, memory: int | None, chunk: int | None, parts: int = 1) -> Sizes:
-    """Sizes that stay within ``memory`` bytes, with a chunk for each part where there are as many
-    blocks. Raises ValueError for a memory or a chunk that is not possible.
+    """Sizes within ``memory`` bytes, with at least one chunk for each part if there are enough
+    blocks. Raises ValueError for an impossible memory or chunk.
     """
     block, devices = job.block.size, len(job.block.devices)
     chunk = plain_number(chunk)
@@ -371,7 +371,7 @@ def chunk_sizes(job: Job, memory: int | None, chunk: int | None, parts: int = 1)
     available = (_DEFAULT_MEMORY if memory is None else memory) - _PROCESS_BYTES
 
     def required(blocks: int) -> int:
-        """Bytes for one chunk of so many blocks."""
+        """Bytes for one chunk of ``blocks`` blocks."""
         return block_bytes * (_COPIES * (blocks if job.trajectories else 1) + 2 * devices)
 
     if memory is not None and required(1) > available:
@@ -387,7 +387,7 @@ def chunk_sizes(job: Job, memory: int | None, chunk: int | None, parts: int = 1)
         target = _CHUNK_BYTES // block_bytes if job.trajectories else _STATISTICS_BLOCKS
         while target > 1 and required(target) > available:
             target //= 2
-        # every device computes a block of its own at a time
+        # a multiple of the number of devices, since each computes one block at a time
         blocks = devices * -(-target // devices) if target > 0 else 1
         all_blocks = -(-job.block.ensemble.bodies // block)
         blocks = min(blocks, all_blocks, max(1, all_blocks // parts))
@@ -404,19 +404,19 @@ def _cores() -> int:
 
 
 def _complete_here(job: Job, numbers: range, concurrent: int) -> Iterator[tuple[int, bool]]:
-    """Complete the chunks in this process, ``concurrent`` at a time: (number, whether it was
-    computed) of each. One is compressed and written while others are computed.
+    """Complete the chunks in this process, ``concurrent`` at a time; yields (number, whether it was
+    computed). Chunks are compressed and written while others are computed.
     """
     assert job.store is not None
     if concurrent == 1:
         yield from ((k, job.complete(k)) for k in numbers)
         return
     if set(numbers).intersection(job.store.missing()):
-        job.block.compile()  # in this thread, and once
+        job.block.compile()  # once, before the threads start
     x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
 
     def complete(k: int) -> tuple[int, bool]:
-        with jax.enable_x64(x64):  # a setting that may be one of the calling thread
+        with jax.enable_x64(x64):  # may be set in the calling thread only
             return k, job.complete(k)
 
     remaining, running = iter(numbers), set()
@@ -439,8 +439,8 @@ def _complete_here(job: Job, numbers: range, concurrent: int) -> Iterator[tuple[
 
 
 class _Tally:
-    """Counts bodies and reports them. Chunks whose files are there count as reused until they turn
-    out to be damaged.
+    """Counts finished bodies and reports progress. Chunks with existing files count as reused until
+    they are found damaged and computed again.
     """
 
     def __init__(self, job: Job, numbers: range, progress: Callable[[Progress], None]):
@@ -489,12 +489,13 @@ def _title() -> dict[str, str]:
     }
 
 
-# Chunks computed by the workers of a dask cluster, which must see the store. dask sends the numbers
-# of chunks to its workers and handles those that are lost; each worker builds the job once, and
-# completes chunks by the same function as a run without dask.
+# Chunks computed by the workers of a dask cluster, which need access to the store. dask distributes
+# the chunk numbers and handles lost workers; each worker builds the job once, and completes chunks
+# by the same function as a run without dask.
 
 _RETRIES = 2
-# of the process that starts the run; a worker shares its cache of compiled programs
+# JAX settings that workers copy from the process that starts the run; with the persistent cache,
+# they share compiled programs.
 _SETTINGS = (
     "jax_enable_x64",
     "jax_compilation_cache_dir",
@@ -506,7 +507,7 @@ _BUILD_LOCK = threading.Lock()
 
 @contextlib.contextmanager
 def _connection(scheduler: Any) -> Iterator[Any]:
-    """The client of an address; a client as it is; for None the active client, or None.
+    """The client for an address; a client unchanged; for None the active client, or None.
 
     Raises StoreError when no scheduler answers.
     """
@@ -529,7 +530,7 @@ def _connection(scheduler: Any) -> Iterator[Any]:
 
 
 def _completed(client: Any, job: Job, numbers: range) -> Iterator[tuple[int, bool]]:
-    """Complete the chunks on the workers of a client: (number, whether it was computed) of each."""
+    """Complete the chunks on the workers of a client; yields (number, whether it was computed)."""
     cloudpickle, distributed = (
         imported("a run on a dask cluster", name, extra="dask")
         for name in ("cloudpickle", "distributed")
@@ -552,7 +553,7 @@ def _completed(client: Any, job: Job, numbers: range) -> Iterator[tuple[int, boo
 def _complete(k: int, settings: dict[str, Any], message: bytes) -> tuple[int, bool]:
     """Complete chunk ``k``; runs on a worker."""
     with _BUILD_LOCK:
-        for name, value in settings.items():  # before arrays of 64 bits are unpickled
+        for name, value in settings.items():  # before 64-bit arrays are unpickled
             if value is not None and getattr(jax.config, name) != value:
                 jax.config.update(name, value)
         job = _build(message)
@@ -575,7 +576,8 @@ def _build(message: bytes) -> Job:
 
 
 def _reference(array: np.ndarray) -> Any:
-    """A file instead of an array that is mapped from it as a whole."""
+    """A reference to the file of a memory-mapped array, so that its numbers are not sent; an array
+    in memory, or a part of a mapped one, is returned as an array."""
     if not isinstance(array, np.memmap) or isinstance(array.base, np.ndarray):
         return np.asarray(array)
     if array.filename is None:

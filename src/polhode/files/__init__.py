@@ -41,7 +41,7 @@ _BUILDERS = (
     "build_state",
     "draw_clones",
 )
-# imported on first use: the command line answers before
+# imported on first use, so that the command line starts quickly
 _MODULES = dict.fromkeys(_BUILDERS, "_build") | {
     "SceneFile": "_models",
     "reference_motions": "_write",

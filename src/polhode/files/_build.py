@@ -1,4 +1,4 @@
-"""From a checked scene file to the objects of polhode, in a floating-point dtype."""
+"""Builders of polhode's objects from a validated scene file, in a given floating-point dtype."""
 
 import functools
 import inspect
@@ -25,7 +25,7 @@ from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
 if TYPE_CHECKING:
     import diffrax
 
-_MAX_ROUNDS = 100  # of drawing moments until they are those of a body
+_MAX_ROUNDS = 100  # rounds of drawing moments until enough of them are physical
 _TORQUES = {
     "body": "BodyTorque",
     "space": "SpaceTorque",
@@ -54,14 +54,14 @@ def build_table(file: SceneFile, table: TimeTable, dtype: DTypeLike) -> "polhode
 
 
 def _over_time(file: SceneFile, value: Any, dtype: DTypeLike) -> Any:
-    """A constant, or the table over time in its place."""
+    """A constant as an array, or a ``Table`` over time."""
     if isinstance(value, TimeTable):
         return build_table(file, value, dtype)
     return np.asarray(value, dtype)
 
 
 def build_inertia(file: SceneFile, dtype: DTypeLike = float) -> "Inertia | VariableInertia":
-    """The nominal inertia. Raises SceneFileError for moments that no body has."""
+    """The nominal inertia. Raises SceneFileError for unphysical moments."""
     table = file.inertia
     kind, value = next((name, value) for name, value in table.entries() if name != "unit")
     with scene_errors(file, f"[inertia] {kind}"):
@@ -80,7 +80,7 @@ def build_inertia(file: SceneFile, dtype: DTypeLike = float) -> "Inertia | Varia
 
 
 def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
-    """SceneFileError for a row of moments (n, 3) or tensors (n, 9) that no body has."""
+    """SceneFileError for an unphysical row of moments (n, 3) or tensors (n, 9)."""
     if rows.shape[-1] == 9:
         tensors = rows.reshape(-1, 3, 3)
         rows = np.linalg.eigvalsh((tensors + np.swapaxes(tensors, 1, 2)) / 2)
@@ -97,7 +97,7 @@ def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
 
 
 def _numbers(table: Table, dtype: DTypeLike, *others: str) -> dict[str, np.ndarray]:
-    """The keys that hold numbers: all but the `others`."""
+    """The numbers of a table by key: all keys but the `others`."""
     return {k: np.asarray(value, dtype) for k, value in table.entries() if k not in others}
 
 
@@ -109,7 +109,7 @@ def _solid(table: AnySolid, dtype: DTypeLike) -> MassProperties:
 
 
 def _float_parts(part: Any, dtype: DTypeLike) -> Any:
-    """The part with all numbers, defaults too, in the dtype."""
+    """The part with all numbers, including defaults, in the dtype."""
     return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_array_like(x) else x, part)
 
 
@@ -150,7 +150,7 @@ class _Velocity(eqx.Module):
 
 
 def _surface_torque(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
-    """Drag and solar pressure."""
+    """The torque of drag or solar pressure."""
     plates = _plates(table, dtype)
     if table.kind == "drag":
         density = _over_time(file, table.density, dtype)
@@ -226,7 +226,7 @@ def _rotor(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
 
 
 class _PointingLaw(eqx.Module):
-    """The torque that a cluster of wheels is to exert on the body."""
+    """Commanded torque of a wheel cluster: a pointing law."""
 
     law: "polhode.Pointing"
 
@@ -247,7 +247,7 @@ def _cluster(file: SceneFile, table: Any, dtype: DTypeLike, first_wheel: int) ->
 
 
 def _wheels(file: SceneFile, dtype: DTypeLike) -> Any:
-    """Single wheels and clusters, in this order."""
+    """All wheels of the scene: [[rotors]], then [[clusters]]."""
     wheels = _sum(file, "rotors", _rotor, None, dtype)
     first_wheel = len(file.rotors)
     for index, table in enumerate(file.clusters):
@@ -262,7 +262,7 @@ def _wheels(file: SceneFile, dtype: DTypeLike) -> Any:
 
 
 def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLike) -> Any:
-    """The parts of a list of tables, added; None where there is none."""
+    """The sum of the parts of a list of tables; None for an empty list."""
     parts, tables = [], getattr(file, key)
     for index, table in enumerate(tables):
         with scene_errors(file, f"[{key}]" if len(tables) == 1 else f"[{key} {index + 1}]"):
@@ -279,7 +279,7 @@ def build_scene(
 
     `dtype`: of its numbers; `float` is the default precision of JAX.
 
-    Raises SceneFileError, naming the place, for numbers that a constructor refuses.
+    Raises SceneFileError, with the place in the file, for numbers that a constructor rejects.
     """
     inertia = build_inertia(file, dtype) if inertia is None else inertia
     orbit = build_orbit(file, dtype)
@@ -304,13 +304,13 @@ def build_events(file: SceneFile, dtype: DTypeLike = float) -> dict[str, "polhod
                 for x in (table.axis_body, table.direction_space)
             )
             function = _Angle(axis, space, jnp.asarray(table.angle, dtype))
-            direction = -direction  # the cosine falls where the angle grows
+            direction = -direction  # the cosine decreases as the angle increases
         events[table.name] = polhode.Event(function, direction)
     return events
 
 
 class _RateLimit(eqx.Module):
-    """|omega|^2 less that of the limit."""
+    """|omega|^2 minus the square of the limit."""
 
     limit: Array
 
@@ -319,7 +319,7 @@ class _RateLimit(eqx.Module):
 
 
 class _Angle(eqx.Module):
-    """Cosine of the angle from a body axis to a direction in space, less that of the limit."""
+    """Cosine of the angle between a body axis and a direction in space, minus that of the limit."""
 
     axis_body: Array
     direction_space: Array
@@ -331,7 +331,7 @@ class _Angle(eqx.Module):
 
 
 def _rates_of(file: SceneFile, inertia, wxyz: Array, momentum: Array, start: Array) -> Array:
-    """Body rates (..., 3) of the momentum (..., 3), that of the wheels included."""
+    """Body rates (..., 3) for the total body momentum (..., 3), wheels included."""
     scene = polhode.Scene(inertia, rotors=_wheels(file, momentum.dtype))
     return scene.with_momentum(polhode.State(wxyz, momentum), momentum, start).omega_body
 
@@ -356,7 +356,7 @@ def build_state(
 
 
 def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
-    """The method object, or None when the planner is to choose.
+    """The method object, or None for an automatic choice.
 
     Raises SceneFileError for a solver that neither polhode nor diffrax has.
     """
@@ -413,7 +413,7 @@ def _solver(file: SceneFile, name: str) -> "diffrax.AbstractSolver":
 
 
 class Clones(NamedTuple):
-    """A batch of bodies, the nominal one first; `redrawn` draws had moments that no body has."""
+    """A batch of bodies, the nominal one first; `redrawn`: number of unphysical draws, rejected."""
 
     inertia: Inertia
     state: "polhode.State"
@@ -424,8 +424,8 @@ def draw_clones(file: SceneFile, dtype: DTypeLike = float) -> Clones:
     """The nominal body followed by the clones of [monte_carlo], drawn in float64 from its seed.
 
     Every quantity has its own stream of random numbers, so that adding a spread for one does not
-    change the draws of the others. Moments that break the triangle inequality are drawn again.
-    Raises SceneFileError when nearly all draws are impossible.
+    change the draws of the others. Moments that violate the triangle inequality are drawn again.
+    Raises SceneFileError if too few draws are physical.
     """
     plan = file.monte_carlo
     nominal = build_inertia(file, dtype)

@@ -1,7 +1,7 @@
-"""What a scene file may say: one pydantic model a table. `polhode schema` prints their JSON Schema.
+"""The schema of scene files: one pydantic model per table. `polhode schema` prints it as JSON.
 
-Numbers are in SI once a table is checked. Nothing here needs numpy or JAX, so that a mistake in a
-file is reported at once; what gives arrays imports numpy when it is called.
+Numbers are in SI units after validation. The module imports neither NumPy nor JAX, so that mistakes
+in a file are reported quickly; properties that return arrays import NumPy when they are called.
 """
 
 import math
@@ -97,12 +97,12 @@ class Times(Table):
             return self.number
         assert self.stop is not None
         assert self.step is not None
-        # a whole number of steps, but for rounding, has its last sample at stop
+        # the factor keeps the last sample at stop if rounding makes the quotient a little smaller
         return math.floor(abs(self.stop - self.first) / self.step * (1 + 1e-12)) + 1
 
     @property
     def unit_seconds(self) -> float:
-        """The unit of tables and figures, s."""
+        """The unit of these times, which tables and figures use as well, in s."""
         return _values.SECONDS[self.unit]
 
     @property
@@ -203,7 +203,7 @@ class Observations(Table):
 
     @property
     def attitudes(self) -> Attitudes:
-        """Those of the rows, NaN where a row has none."""
+        """Attitudes of the rows, NaN where a row has none."""
         if any(row.angles is not None for row in self.rows):
             return Attitudes(_columns([row.angles for row in self.rows], 3), self.sequence)
         return Attitudes(_columns([row.wxyz for row in self.rows], 4))
@@ -235,7 +235,7 @@ QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body", "to
 
 
 class Spreads(Table):
-    """Bodies drawn around the nominal one."""
+    """Quantities that are drawn at random around the nominal ones."""
 
     @property
     def spreads(self) -> dict[str, Any]:
@@ -322,7 +322,7 @@ class AngleDraw(Draw):
 
 class AttitudeDraw(AngleDraw):
     one_of = (("sigma", "half_width", "any"),)
-    any: Literal[True] | None = Field(None, description="true: every attitude alike")
+    any: Literal[True] | None = Field(None, description="true: all attitudes equally probable")
 
 
 class RatesDraw(Draw):
@@ -338,7 +338,7 @@ class TorqueDraw(Draw):
 
 
 class Arrays(Table):
-    """Files of NumPy (.npy) below the scene's folder with a row for each body, SI."""
+    """NumPy files (.npy) in the scene's folder or below, with one row per body, in SI units."""
 
     moments: BelowFolder | None = None
     wxyz: BelowFolder | None = None
@@ -438,12 +438,12 @@ class SceneFile(Table):
 
     @property
     def text(self) -> str:
-        """What was read."""
+        """The text of the file."""
         return self._text
 
     @property
     def rows(self) -> "Mapping[str, np.ndarray]":
-        """Of [ensemble.arrays], left on the disk."""
+        """The arrays of [ensemble.arrays], memory-mapped."""
         return self._rows
 
     @property
@@ -455,7 +455,7 @@ class SceneFile(Table):
             yield from _tables_of(place, torque)
 
     def columns(self, table: TimeTable) -> tuple[list[float], list[Any]]:
-        """Times [s] and values of a table; of a file those that were read with the scene."""
+        """Times [s] and values of a table; those of a CSV file were read with the scene."""
         if table.file is None:
             assert table.times is not None
             assert table.values is not None
@@ -547,7 +547,7 @@ class SceneFile(Table):
                         " add `epoch = 1992-11-09T17:49:47Z`"
                     )
                 time = (row.utc - self.epoch).total_seconds()
-            assert time is not None  # a row has one of both
+            assert time is not None  # a row has either utc or time
             if not last < time < math.inf:
                 raise ValueError(
                     "[observations] rows must be in the order of time: sort the rows (row"

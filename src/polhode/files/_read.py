@@ -1,6 +1,6 @@
-"""Reading a scene file: from its text to the checked model, with errors in one readable block.
+"""Reading and validation of scene files, with readable error messages.
 
-Needs neither NumPy (except for [ensemble.arrays]) nor JAX: a mistake is reported in a fraction of a
+Needs neither JAX nor NumPy (except for [ensemble.arrays]): a mistake is reported in a fraction of a
 second.
 """
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 class SceneFileError(ValueError):
-    """A scene file that cannot be used.
+    """Raised for a scene file that cannot be used.
 
-    `str(error)` is a readable block of a few lines: the file and key, the value, what is expected,
-    and how to correct it. These are its attributes `file`, `key`, `problem`, `value`, `expected`,
-    `fix` and `also` (further errors), all texts.
+    `str(error)` is a readable block of a few lines: the file and key, the value, the expected one,
+    and how to correct it. Attributes, all texts: `file`, `key`, `problem`, `value`, `expected` and
+    `fix`. The message also lists further errors.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class SceneFileError(ValueError):
 
 @contextlib.contextmanager
 def scene_errors(file: "SceneFile", where: str) -> Iterator[None]:
-    """Turn the error of a constructor into one that names the place in the scene file."""
+    """Convert the error of a constructor to a SceneFileError with the place in the scene file."""
     try:
         yield
     except SceneFileError:
@@ -61,21 +61,21 @@ def scene_errors(file: "SceneFile", where: str) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """What went wrong, without the number that a system error begins with."""
+    """The message of an error, without the error number of a system error."""
     message = error.strerror if isinstance(error, OSError) else None
     return message or str(error) or type(error).__name__
 
 
 class Verbatim(str):
-    """Text that is shown without quotation marks."""
+    """Text that ``shorten`` shows without quotation marks."""
 
     def __repr__(self) -> str:
         return str(self)
 
 
 def escape(text: str) -> str:
-    """The text on one line, with every character that a terminal would obey (escapes, line ends,
-    marks that reverse the direction) or cannot show written as \\x1b, \\u202e and the like.
+    """The text on one line, with control characters (escape sequences, line ends, marks that change
+    the text direction) and unprintable ones written as \\x1b, \\u202e and so on.
     """
     if text.isprintable():
         return text
@@ -83,16 +83,16 @@ def escape(text: str) -> str:
 
 
 def shorten(value: object, length: int = 80) -> str:
-    """A value of the file as it is shown in a message, on one line and not too long."""
+    """A value for a message, on one line of at most ``length`` characters."""
     try:
         text = " ".join(repr(value).split())
-    except ValueError:  # an integer of more digits than Python writes out
+    except ValueError:  # an integer with more digits than Python converts to text
         return "a number of thousands of digits"
     return text if len(text) <= length else text[: length - 4] + " ..."
 
 
 def did_you_mean(word: object, choices: Iterable[str]) -> str:
-    """A question with the choice that is close to another one, or nothing."""
+    """'did you mean "..."?' with the choice closest to a word, or an empty string."""
     names = {name.lower(): name for name in choices}
     close = difflib.get_close_matches(str(word)[:100].lower(), names, 1, 0.6)
     return f'did you mean "{names[close[0]]}"?' if close else ""
@@ -136,8 +136,8 @@ def read_scene(path: str | os.PathLike) -> "SceneFile":
 def parse_scene(
     text: str, path: str | os.PathLike = "<text>", *, files: bool = True
 ) -> "SceneFile":
-    """`read_scene` of a text; `path` is the name used in messages, and its folder that of the files
-    of [ensemble.arrays] and of tables over time, which are not read without `files`.
+    """`read_scene` for a text. `path`: its name in messages; files of [ensemble.arrays] and of
+    tables over time are searched in its folder, or not read at all with `files=False`.
     """
     path = Path(path)
     file = _validate(text, path)
@@ -181,7 +181,7 @@ _DOTTED = re.compile(rf"(?<![\w.\"'-])(?:[\w\"'-]++\.){{{MAX_KEY_PARTS},}}")
 
 
 def _limit_keys(text: str, path: Path) -> None:
-    """Refuse dotted keys of hundreds of parts: their time grows as the square of the number."""
+    """Reject dotted keys of hundreds of parts: ``tomllib`` needs quadratic time for them."""
     dense = _SPACE_AFTER_DOT.sub("", _SPACE_BEFORE_DOT.sub("", text))
     if match := _DOTTED.search(dense):
         line = dense.count("\n", 0, match.start()) + 1
@@ -190,8 +190,8 @@ def _limit_keys(text: str, path: Path) -> None:
 
 
 def _scene_error(path: Path, data: Any, errors: list[Any]) -> SceneFileError:
-    """What pydantic found wrong: the first error with its value, and the places of the others."""
-    # a key that is there and unknown explains one that is missing
+    """The errors of pydantic as one: the first with its value, and the places of the others."""
+    # unknown keys first and missing ones last: a misspelt key is often the cause of a missing one
     errors = sorted(errors, key=lambda e: (e["type"] == "missing", e["type"] != "extra_forbidden"))
     first, *others = errors
     place = _place(first, data)
@@ -211,7 +211,7 @@ def _message(error: Any) -> str:
 
 
 def _suggestion(error: Any, data: Any) -> str:
-    """The key or the choice that was probably meant, or nothing."""
+    """``did_you_mean`` for an unknown key or choice, or an empty string."""
     if error["type"] == "extra_forbidden":
         word, choices = str(error["loc"][-1]), _keys(error["loc"][:-1], data)
     elif error["type"] in ("literal_error", "union_tag_invalid"):
@@ -224,24 +224,24 @@ def _suggestion(error: Any, data: Any) -> str:
 
 
 def _keys(place: Iterable[str | int], data: Any) -> set[str]:
-    """The keys of the table at a place of an error, of all kinds that its own keys leave open."""
+    """The possible keys of the table at the place of an error, for all kinds it may be of."""
     from polhode.files._models import SceneFile
 
     tables: list[Any] = [SceneFile]
     for step in place:
-        if isinstance(step, int):  # a row of a list, or of a table that stands for one
+        if isinstance(step, int):  # an entry of a list, or a single table in place of a list
             data = data[step] if isinstance(data, list) else data
         elif isinstance(data, dict) and step in data:
             data = data[step]
             fields = [table.model_fields[step] for table in tables if step in table.model_fields]
             tables = [table for field in fields for table in _tables(field.annotation)]
-        else:  # a mark of pydantic's own: the kind of a table
+        else:  # a tag that pydantic adds: the kind of a table
             tables = [table for table in tables if step in _choices(table)] or tables
     return {key for table in tables for key in table.model_fields}
 
 
 def _tables(annotation: Any) -> Iterator[Any]:
-    """The classes of tables that an annotation names."""
+    """The table classes in an annotation."""
     from polhode.files._values import Table
 
     if isinstance(annotation, type) and issubclass(annotation, Table):
@@ -251,14 +251,14 @@ def _tables(annotation: Any) -> Iterator[Any]:
 
 
 def _choices(table: Any) -> set[Any]:
-    """The words that select this kind of table: those of its key ``kind`` or ``shape``."""
+    """The values of the key ``kind`` or ``shape`` that select this class of table."""
     kinds = [table.model_fields.get(name) for name in ("kind", "shape")]
     return {word for field in kinds if field for word in get_args(field.annotation)}
 
 
 def _place(error: Any, data: Any) -> str:
-    """The place of an error as TOML calls it, such as "[state.omega_body] unit". Rows of a list
-    are counted from 1.
+    """The place of an error in TOML notation, such as "[state.omega_body] unit". Entries of a list
+    are numbered from 1.
     """
     path: list[str] = []
     for step in error["loc"]:
@@ -268,7 +268,7 @@ def _place(error: Any, data: Any) -> str:
         elif isinstance(data, dict) and step in data:
             path.append(shorten(Verbatim(step), 60))
         else:
-            continue  # a mark of pydantic's own, such as the kind of a table
+            continue  # a tag that pydantic adds, such as the kind of a table
         data = data[step]
     if error["type"] == "missing":
         path.append(str(error["loc"][-1]))
@@ -286,7 +286,7 @@ _VALID_ROWS = dict.fromkeys(_WIDTHS, "finite numbers") | {
 
 
 def _read_arrays(names: Mapping[str, str], bodies: int, scene: Path) -> "dict[str, np.ndarray]":
-    """The arrays (bodies, width), left on the disk, every row checked. Raises SceneFileError."""
+    """The memory-mapped arrays (bodies, width), validated. Raises SceneFileError."""
     return {name: _read_array(name, text, bodies, scene) for name, text in names.items()}
 
 
@@ -303,12 +303,12 @@ def _read_array(name: str, text: str, bodies: int, scene: Path) -> "np.ndarray":
     if not path.is_relative_to(folder):
         raise error_of("a link that leaves the folder of the scene", text, f"a file in {folder}")
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for, for ever
+        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe might block for ever
             raise error_of("cannot be read: not a regular file")
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except SceneFileError:
         raise
-    except Exception as error:  # a damaged header fails in whichever part of NumPy meets it first
+    except Exception as error:  # NumPy raises many types of errors for a damaged header
         raise error_of(f"cannot be read: {reason(error)[:200]}") from error
     if not isinstance(rows, np.ndarray):
         raise error_of("wrong shape or type", f"{text}: {type(rows).__name__}")
@@ -343,7 +343,7 @@ def _read_tables(file: "SceneFile", scene: Path) -> dict[str, list[list[float]]]
 
 
 def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:
-    """Rows of numbers separated by commas; a first row of names, empty lines and what follows a
+    """Rows of numbers separated by commas. A first row of names, empty lines and comments after
     ``#`` are skipped."""
 
     def error_of(problem: str, value: str = text) -> SceneFileError:
@@ -381,8 +381,10 @@ def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:
 
 
 def possible_moments(moments: Any, rounded: bool = True) -> Any:
-    """Which rows (..., 3) of NumPy or JAX are positive and obey the triangle inequality; numbers
-    that are ``rounded``, such as those of a flat body, within the tolerance of ``ph.Inertia``."""
+    """Which moments (..., 3), of NumPy or JAX, are positive and satisfy the triangle inequality.
+
+    ``rounded``: with the tolerance of ``ph.Inertia``, for rounded numbers, such as of a flat body.
+    """
     import numpy as np
 
     tolerance = float(np.sqrt(np.finfo(moments.dtype).eps)) if rounded else 0.0
@@ -391,7 +393,7 @@ def possible_moments(moments: Any, rounded: bool = True) -> Any:
 
 
 def _first_invalid(name: str, rows: "np.ndarray", step: int = 2**20) -> int | None:
-    """The first row that no body can have; a million rows are in memory at a time."""
+    """The index of the first invalid row, or None. Reads ``step`` rows into memory at a time."""
     import numpy as np
 
     for start in range(0, len(rows), step):

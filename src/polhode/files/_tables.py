@@ -1,4 +1,4 @@
-"""Tables of a scene file that say what the body is, how it starts and what acts on it: SI units."""
+"""Tables of a scene file for the body, its initial state and its torques, in SI units."""
 
 import math
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ class Attitudes(NamedTuple):
 
 
 class Euler(Measured):
-    """Turns about the body's own axes, first letter first: R = R_a(1) R_b(2) R_c(3)."""
+    """Rotations about body axes, in the order of the letters: R = R_a(1) R_b(2) R_c(3)."""
 
     measures = ("angles",)
     sequence: Sequence = "ZYZ"
@@ -110,7 +110,7 @@ AnySolid = Annotated[
 
 
 class Inertia(Measured):
-    """Exactly one way to say it; about the centre of mass, or the fixed point under gravity."""
+    """Inertia, given in exactly one form; about the centre of mass, or the fixed point of a top."""
 
     measures = ("moments", "tensor", "axisymmetric", "spherical")
     one_of = ((*measures, "parts", "table"),)
@@ -140,7 +140,7 @@ class Momentum(Measured):
 
 
 def _as_table(value: Any) -> Any:
-    """Plain numbers are those in the SI unit."""
+    """Plain numbers as a table in SI units."""
     return value if isinstance(value, Mapping) else {"value": value}
 
 
@@ -151,7 +151,7 @@ AnyMomentum = Annotated[
 
 
 class Oriented(Table):
-    """A table with an attitude, body -> space; that of space axes where it is left out."""
+    """A table with an attitude, body -> space; the identity if it is left out."""
 
     wxyz: Quaternion | None = Field(None, description="scalar first")
     euler: Euler | None = None
@@ -185,7 +185,7 @@ class State(Oriented):
 
     @property
     def rate(self) -> str:
-        """Which of rates and momentum is given."""
+        """The key of the initial rates or momentum."""
         return "momentum_body" if self.omega_body is None else "omega_body"
 
     @property
@@ -222,7 +222,7 @@ class Orbit(Measured):
 
     @property
     def is_hyperbolic(self) -> bool:
-        """Whether the numbers are those of a fly-by."""
+        """Whether the orbit is a hyperbola."""
         if self.position is None or self.velocity is None:
             return self.eccentricity is not None and self.eccentricity > 1
         return math.hypot(*self.velocity) ** 2 * math.hypot(*self.position) > 2 * self.mu
@@ -244,7 +244,7 @@ class UniformGravity(Action):
 
 
 class GravityGradient(Action):
-    """Of a centre at rest (`mu`, `position_space`), or on the [orbit] (neither of them)."""
+    """Gravity gradient of a fixed centre (`mu`, `position_space`), or on the [orbit] (neither)."""
 
     kind: Literal["gravity-gradient"]
     mu: Number | None = None
@@ -313,8 +313,8 @@ class BDot(Table):
 
 
 class Magnetorquer(Torque):
-    """N = m x B, of a constant moment or the B-dot law, in a constant field or that of a dipole at
-    the centre of the [orbit].
+    """N = m x B, with a constant moment or the B-dot law, in a constant field or that of a dipole
+    at the centre of the [orbit].
     """
 
     kind: Literal["magnetorquer"]
@@ -361,7 +361,7 @@ class Plated(Torque):
     plates: Annotated[list[Plate], Field(min_length=1, max_length=1000)]
 
     def coefficients_of_plates(self, *names: str) -> None:
-        """ValueError unless these are one number, or as many as there are plates."""
+        """ValueError unless each of these is one number or a list of one number per plate."""
         for name in names:
             value = getattr(self, name)
             if isinstance(value, list) and len(value) != len(self.plates):
@@ -392,7 +392,7 @@ class Drag(Plated):
 
 
 class Shadow(Table):
-    """The cylindrical shadow of the planet that the [orbit] is around."""
+    """The cylindrical shadow of the central body of the [orbit]."""
 
     radius: Positive = Field(6.378137e6, description="m")
 
@@ -425,7 +425,7 @@ class SolarPressure(Plated):
 
 
 class ControlMomentGyro(Torque):
-    """A wheel of constant momentum on a gimbal that turns as `angle` says."""
+    """A wheel of constant momentum on a gimbal with a prescribed `angle`."""
 
     kind: Literal["control-moment-gyro"]
     frame: Literal["inertial"] = "inertial"
@@ -436,7 +436,7 @@ class ControlMomentGyro(Torque):
 
 
 class Pulses(Torque):
-    """A constant torque that acts from each of `starts` to the one of `ends` in its place."""
+    """A constant torque that acts from each of `starts` to the corresponding entry of `ends`."""
 
     kind: Literal["pulses"]
     n: Vector
@@ -470,7 +470,7 @@ class Motor(Table):
 
 
 class Rotor(Table):
-    """A wheel: its momentum or speed is relative to the body."""
+    """A wheel, with its momentum or speed relative to the body."""
 
     one_of = (("momentum", "speed"),)
     axis_body: Direction
@@ -506,7 +506,7 @@ class Cluster(Oriented):
 
 
 class Event(Measured):
-    """When a body axis crosses an angle from a direction in space, or the rate a limit."""
+    """A body axis crosses a given angle from a direction in space, or the rate crosses a limit."""
 
     one_of = (("angle", "rate"),)
     measures = ("angle", "rate")
@@ -540,7 +540,7 @@ class Event(Measured):
 
 
 def _as_list(value: Any) -> Any:
-    """One table counts as a list of one."""
+    """A single table as a list of one."""
     return [value] if isinstance(value, Mapping) else value
 
 

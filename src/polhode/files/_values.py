@@ -1,6 +1,6 @@
-"""What every table of a scene file is made of: tables, single values, values over time, units.
+"""Building blocks of the tables of a scene file: base classes, values, values over time, units.
 
-pydantic checks them. Nothing here needs NumPy or JAX.
+pydantic validates them. The module needs neither NumPy nor JAX.
 """
 
 import datetime
@@ -46,7 +46,7 @@ Quaternion = Annotated[
 
 
 def _three(value: Any) -> Any:
-    """One number is that of all three axes."""
+    """A single number as that of all three axes."""
     return [value] * 3 if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
@@ -138,7 +138,7 @@ SI = SECONDS | ANGLES | ANGULAR_RATES | MOMENTS | {"kg m^2/s": 1.0, "N m": 1.0}
 
 
 class Table(BaseModel):
-    """A table; of each group in `one_of` exactly one key must be there."""
+    """A table; exactly one key of each group in `one_of` is required."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
     one_of: ClassVar[tuple[tuple[str, ...], ...]] = ()
@@ -153,12 +153,12 @@ class Table(BaseModel):
         return self
 
     def entries(self) -> Iterator[tuple[str, Any]]:
-        """Names and values of the keys that hold something."""
+        """Names and values of the keys that are not None."""
         return ((name, value) for name, value in self if value is not None)
 
 
 class Measured(Table):
-    """A table with a `unit`: once it is checked, the numbers in `measures` are in SI."""
+    """A table with a `unit`; validation converts the numbers in `measures` to SI."""
 
     measures: ClassVar[tuple[str, ...]] = ("value",)
 
@@ -178,13 +178,13 @@ def scale(value: Any, factor: float) -> Any:
     return value * factor
 
 
-# Values that may be constant or tables over time.
+# Values that may be constants or tables over time.
 
 
 class TimeTable(Table):
     """Values over time: `times` and `values`, or the columns of a CSV `file` beside the scene.
 
-    The first column of the file is the time. In SI units but for the times.
+    The first column of the file is the time. All but the times are in SI units.
     """
 
     widths: ClassVar[tuple[int, ...]]
@@ -213,7 +213,7 @@ class TimeTable(Table):
 
 
 def check_columns(times: list[float], values: list[Any], widths: tuple[int, ...]) -> None:
-    """ValueError unless times ascend and all values have one and the same of these widths."""
+    """ValueError unless times increase and all values have the same width, one of ``widths``."""
     for index, (a, b) in enumerate(itertools.pairwise(times)):
         if not a < b:
             raise ValueError(f"the times must ascend (entry {index + 2} is {b} after {a})")
@@ -246,7 +246,7 @@ class InertiaTable(TimeTable):
 
 
 def _kind_of(value: Any) -> str:
-    """Whether a value is meant as a constant or as a table over time: errors are those of this."""
+    """The alternative that a value stands for, so that pydantic reports its errors only."""
     if isinstance(value, str):
         return "word"
     return "table" if isinstance(value, Mapping | TimeTable) else "constant"

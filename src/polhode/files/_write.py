@@ -1,5 +1,5 @@
-"""What is written to files: NetCDF, the versions of the libraries that computed it, and the
-reference motions of free bodies."""
+"""NetCDF output, versions of the libraries for its metadata, and reference motions of torque-free
+bodies."""
 
 import csv
 import functools
@@ -24,13 +24,13 @@ LIBRARIES = ("jax", "jaxlib", "diffrax", "equinox", "numpy")
 
 
 def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
-    """Write a dataset (`Trajectory.to_xarray()`) as compressed NetCDF-4, whole or not at all.
+    """Write a dataset (`Trajectory.to_xarray()`) atomically as compressed NetCDF-4.
 
-    The file is made in memory first: HDF5 ends the process when the disk is full. Needs xarray,
-    h5netcdf and h5py (the extra `cli`). Returns the path. Raises OSError when the
+    The file is made in memory first, because HDF5 aborts the process when the disk is full. Needs
+    xarray, h5netcdf and h5py (the extra `cli`). Returns the path. Raises OSError when the
     folder is missing, full or not writable; an existing file is then unchanged.
     """
-    imported("writing NetCDF", "h5netcdf", "h5py")  # the one does not install the other
+    imported("writing NetCDF", "h5netcdf", "h5py")  # h5netcdf does not depend on h5py
     compression = {"zlib": True, "complevel": 4, "shuffle": True}
     variables = dataset.variables.items()
     arrays = [name for name, array in variables if array.ndim and array.dtype.kind in "fiu"]
@@ -41,8 +41,8 @@ def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
 
 
 def versions() -> dict[str, str]:
-    """NAME_version of polhode, Python and the libraries that compute; a note where fused kernels
-    and the other optimisations for CPUs are off, since results differ by rounding.
+    """NAME_version of polhode, Python and the numerical libraries; also an entry if fused kernels
+    and the other CPU optimisations are off, because results then differ by rounding.
     """
     import polhode
     from polhode._policy import plain_reason
@@ -58,9 +58,9 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def commit() -> str:
-    """The commit that polhode was installed from or is run from; empty where that is not known.
+    """The commit from which polhode was installed or is run; empty if it is not known.
 
-    "+changes" follows that of a checkout with uncommitted changes.
+    "+changes" is appended for a checkout with uncommitted changes.
     """
     folder = Path(__file__).resolve().parents[3]
     if (folder / ".git").exists():
@@ -90,7 +90,7 @@ _COMPONENTS = ("qw", "qx", "qy", "qz", "wx", "wy", "wz")
 
 
 def reference_motions() -> dict[str, Any]:
-    """Motions of free rigid bodies, correct to 17 significant digits, to test a program against.
+    """Motions of torque-free rigid bodies, correct to 17 significant digits, for tests of programs.
 
     The contents of the file that ``polhode reference`` writes: under ``"bodies"`` a list of bodies
     in every regime, each with ``name``, ``title``, ``moments`` (3) [kg m^2], ``wxyz`` (4) and
@@ -121,7 +121,7 @@ def reference_csv() -> str:
 
 
 def _rows() -> Iterator[list[Any]]:
-    # numbers keep the digits of the file: parsed as text
+    # parsed as text, so that the numbers retain the digits of the file
     bodies = json.loads(REFERENCE.read_text(encoding="utf-8"), parse_float=str)["bodies"]
     for body in bodies:
         start = [body["name"], *body["moments"], *body["wxyz"], *body["omega_body"]]

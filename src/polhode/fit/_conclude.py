@@ -40,10 +40,10 @@ def combine_flags(conditions: Mapping[Finding, Array]) -> Array:
 
 
 class Determination(NamedTuple):
-    """How far the data determine p unknowns: ``information`` and ``covariance`` (p, p), directions
-    ``null`` (p, p) that they do not show (zero columns for the others), natural sizes ``safe`` (p,)
-    of 1 over an unknown, how many are not shown, ``noise`` of the residuals over that assumed,
-    ``prior_std`` (p,): of the calibration, infinite for unknowns without a prior."""
+    """How far the data determine p unknowns: ``information`` and ``covariance`` (p, p); ``null``
+    (p, p): undetermined directions as columns, zero for the others; ``safe`` (p,): reciprocal
+    scales of the unknowns; ``null_count``; ``noise``: standard deviation of the residuals over the
+    assumed one; ``prior_std`` (p,): infinite for unknowns without a prior."""
 
     information: Array
     covariance: Array
@@ -55,11 +55,11 @@ class Determination(NamedTuple):
 
 
 def determination_of(solution: Solution, recording: Recording, trust_noise: bool) -> Determination:
-    """What the Jacobian of a fit says about its unknowns, in the order shared, then own.
+    """``Determination`` from the Jacobian of a fit; unknowns in the order shared, then own.
 
     Unknowns with a prior (the sensor's calibration) are eliminated: conditional on them the
-    covariance of the others is the pseudo-inverse of their information, so a direction that the
-    data do not show is found by the data alone, whatever the prior, and in single precision too.
+    covariance of the others is the pseudo-inverse of their information. Null directions then follow
+    from the data alone, whatever the prior, and in single precision too.
     """
     linear = solution.linear
     information = linear.information()
@@ -89,14 +89,15 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     cross = information[np.ix_(free_indices, with_prior_index)]
     width = precision**-0.5
     correction = covariance @ cross
-    # information of the data about the calibration, its unit the standard deviation of the prior
+    # Information of the data about the calibration, in units of the prior's standard deviation.
     block = information[np.ix_(with_prior_index, with_prior_index)]
     data = (block - cross.T @ correction) * width[:, None] * width[None]
     gained_information, axes = eigh((data + data.T) / 2)
-    # The difference of two large matrices: values below its rounding error are no information.
+    # It is the difference of two large matrices: values below the rounding error count as zero.
     rounding = 1e3 * float(jnp.finfo(dtype).eps) * jnp.max(jnp.diagonal(block) * width**2)
     gained_information = jnp.where(gained_information > rounding, gained_information, 0)
-    # Degrees of freedom: an unknown with a prior counts by the part that the data determine.
+    # Degrees of freedom: an unknown with a prior counts by the fraction that the data determine.
+    # That depends on the noise; one fixed-point step suffices.
     noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
     noise = jnp.sqrt(
         square
@@ -105,7 +106,7 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
         )
     )
     variance = jnp.asarray(1, dtype) if trust_noise else noise**2
-    # the mean of 1 / (information / variance + 1) by directions
+    # Posterior covariance of the calibration: 1 / (information / variance + 1) by eigenvectors.
     spread = (
         axes * (1 / (gained_information / jnp.where(variance > 0, variance, 1) + 1))[None]
     ) @ axes.T
@@ -123,12 +124,12 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
         .set(cross_covariance.T)
     )
     full_covariance = full_covariance.at[np.ix_(with_prior_index, with_prior_index)].set(spread)
-    order = (
+    full_null = (
         jnp.zeros((has_prior.size, has_prior.size), dtype)
         .at[np.ix_(free_indices, free_indices)]
         .set(null)
     )
-    sizes = (
+    full_safe = (
         jnp.ones(has_prior.size, dtype)
         .at[free_indices]
         .set(safe)
@@ -138,12 +139,12 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     with_prior = information.at[with_prior_index, with_prior_index].add(precision * variance)
     prior_std = prior_std.at[with_prior_index].set(width)
     return Determination(
-        with_prior, full_covariance, order, sizes, jnp.sum(~determined), noise, prior_std
+        with_prior, full_covariance, full_null, full_safe, jnp.sum(~determined), noise, prior_std
     )
 
 
 def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array]:
-    """Which unknowns, in the order shared, then own, have a prior (static), and its precisions."""
+    """Which unknowns have a prior (static; order shared, then own), and the precisions of those."""
     parameters, model = solution.parameters, solution.model
     prior = prior_of(parameters, recording, model)
     shared = [np.zeros(model.entries, bool)]
@@ -168,7 +169,7 @@ def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array
 
 
 class _Split(NamedTuple):
-    """Standard deviations of the unknowns that recordings share, sorted by what they are of."""
+    """Standard deviations of the shared unknowns: tensor entries, sensor and motion."""
 
     entries: Array
     sensor: dict[str, Array]
@@ -176,7 +177,7 @@ class _Split(NamedTuple):
 
 
 def _sort_by_kind(shared: Any, count: int, parameters: Parameters) -> _Split:
-    """``shared`` (s,), in the order of ``Unknowns``, by what it is of."""
+    """``shared`` (s,), ordered as ``Unknowns.shared``, split after its ``count`` tensor entries."""
     position = count
     sensor, motion = {}, []
 
@@ -203,7 +204,7 @@ def _count_after_motion(parameters: Parameters) -> int:
 
 
 def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
-    """The fitted unknowns of the sensors by name: gain, bias and delay with those calibrated."""
+    """The fitted sensor unknowns by name; gain, bias and delay include the calibrated values."""
     names = ("bias", "mounting", "lever", "gain", "delay")
     parts = {name: getattr(parameters, name) for name in names}
     parts = {name: part for name, part in parts.items() if part is not None}
@@ -220,31 +221,31 @@ def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
 
 
 def _deviations(determination: Determination, count: int) -> Array:
-    """Standard deviations of the first ``count`` unknowns; infinite for what is not shown."""
+    """Standard deviations of the first ``count`` unknowns; infinite for undetermined ones."""
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(determination.covariance), 0))
     null_part = jnp.sqrt(jnp.sum((determination.null * determination.safe[:, None]) ** 2, axis=1))
     return jnp.where(null_part > MAX_NULL_PART, jnp.inf, std)[:count]
 
 
 def _deviations_by_kind(determination: Determination, solution: Solution, count: int) -> _Split:
-    """Standard deviations of the shared unknowns, those of the gain as ``_sensor`` gives it."""
+    """Standard deviations of the shared unknowns; for the gain, of the matrix in ``_sensor``."""
     parameters, gain = solution.parameters, solution.model.gyroscope.gain
     std = _deviations(determination, solution.linear.shared.shape[-1])
     split = _sort_by_kind(std, count, parameters)
     if gain is None or parameters.gain is None:
         return split
     place = np.ravel(_sort_by_kind(np.arange(std.size), count, parameters).sensor["gain"])
-    # entries row by row
-    turn = jnp.kron(gain, jnp.eye(3)).astype(std.dtype)
-    covariance = turn @ determination.covariance[np.ix_(place, place)] @ turn.T
-    is_unknown = jnp.any((jnp.abs(turn) > 0) & jnp.isinf(std[place])[None], axis=1)
-    reading_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
-    split.sensor["gain"] = jnp.where(is_unknown, jnp.inf, reading_std).reshape(3, 3)
+    # derivative of ``gain @ errors`` by ``errors``, both row by row
+    jacobian = jnp.kron(gain, jnp.eye(3)).astype(std.dtype)
+    covariance = jacobian @ determination.covariance[np.ix_(place, place)] @ jacobian.T
+    is_unknown = jnp.any((jnp.abs(jacobian) > 0) & jnp.isinf(std[place])[None], axis=1)
+    gain_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
+    split.sensor["gain"] = jnp.where(is_unknown, jnp.inf, gain_std).reshape(3, 3)
     return split
 
 
 def _initial(parameters: Parameters, recording: Recording, attitude: Array | None) -> State:
-    """States at the first time of each recording; ``attitude``: of those without attitudes."""
+    """States at the first time of each recording; ``attitude``: used where none is recorded."""
     if recording.wxyz is not None:
         turn = rotation_vector_to_wxyz(require_channel("attitude", parameters.attitude))
         return State(multiply(recording.wxyz[:, 0], turn), parameters.omega)
@@ -273,14 +274,15 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
 
     def derived(vector):
         values, axes, products = principal(whole_of(vector, count))
-        # the largest is one to itself, rounding aside
+        # the ratio of the largest moment to itself is exactly 1, with zero derivative
         ratios = (values / values[2]).at[2].set(1)
         return jnp.concatenate([values, ratios, products]), (values, axes)
 
     slope, (moments, axes) = jax.jacfwd(derived, has_aux=True)(entries)
     motion = parameters.motion
     if not model.scale_known and model.motion.scales:
-        # size that the data do not show: a largest moment of one
+        # The data do not determine the size: scale tensor, unknowns and Jacobian to a largest
+        # moment of 1.
         size, motion = moments[2], model.motion.over(motion, moments[2])
         tensor, moments = tensor / size, moments / size
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
@@ -300,7 +302,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     spread = jnp.sqrt(
         jnp.maximum(jnp.sum((full_derivative @ covariance) * full_derivative, axis=1), 0)
     )
-    # what leans on a null direction is not known at all
+    # a quantity with a component along a null direction is undetermined
     leaning = jnp.sqrt(jnp.sum((full_derivative @ null) ** 2, axis=1))
     reach = jnp.sqrt(jnp.sum((full_derivative / safe[None]) ** 2, axis=1))
     reach = jnp.concatenate([reach[:3], reach[:3] / moments[2], reach[6:]])
@@ -341,8 +343,8 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
 
 
 def is_weak(ratios: Float[Array, " 3"], std: Float[Array, " 3"]) -> Array:
-    """Whether a ratio is known to no better than 5 %, or than half of itself: near zero the misfit
-    is far from quadratic over such a range."""
+    """Whether the standard deviation of a ratio exceeds 0.05, or half of the ratio (for ratios near
+    zero): the misfit is not quadratic over such a range."""
     return jnp.any((std > 0.05) | (2 * std > ratios))
 
 
@@ -383,7 +385,7 @@ def _fit_of(
     attitude: Any = None,
     inertia: InertiaEstimate | None = None,
 ) -> Fit:
-    """The result, with the ``findings`` of its kind and those that all fits share."""
+    """The ``Fit``: with the ``findings`` of its kind of fit and those common to all fits."""
     linear, parameters, model = solution.linear, solution.parameters, solution.model
     parts = residuals_by_channel(linear, recording, options.robust)
     whiteness = whiteness_of(linear.residuals, recording.present)
@@ -418,23 +420,24 @@ def _fit_of(
 
 
 def symmetric_std(entries: Float[Array, " e"]) -> Float[Array, "3 3"]:
-    """Standard deviations of a tensor from those of its entries; zero for products left out."""
+    """Standard deviations of a tensor from those of its entries; zero for absent products."""
     return whole_of(entries, entries.shape[0])
 
 
 def turn_std(moments: Float[Array, "3"], products_std: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Standard deviations [rad] about the principal axes of those of the products of inertia."""
+    """Standard deviations [rad] of rotations about the principal axes, from those of the products
+    of inertia in these axes: products over the differences of the moments."""
     gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
     return jnp.where(gaps > 0, products_std / jnp.where(gaps > 0, gaps, 1), jnp.inf)
 
 
 def _with_repulsion(moments: Float[Array, "3"], std: Float[Array, "9"]) -> Float[Array, "9"]:
-    """Standard deviations of moments, ratios and products, with what turns of the axes add.
+    """Standard deviations of moments, ratios and products, including eigenvalue repulsion.
 
     The error p of a product of inertia drives two eigenvalues apart: half of their gap, h, grows by
-    p^2 / (2 h), of which the root mean square is 0.87 std^2 / h. That is of second order, which the
-    covariance does not have, but as large as the error itself where the gap is as small; the whole
-    gap may then be error.
+    p^2 / (2 h), of which the root mean square is 0.87 std^2 / h. This term is of second order, so
+    the (linear) covariance lacks it, but where std is as large as h it is as large as the error
+    itself. It is limited to h, since the whole gap may be an effect of the error.
     """
     pairs = (1, 2), (0, 2), (0, 1)
     variance = std * std
@@ -468,7 +471,7 @@ def is_saturated(recording: Recording) -> Array:
 
 
 def _calibration_strained(solution: Solution, recording: Recording) -> Array:
-    """Whether an unknown of the calibration is more than 3.5 standard deviations off its prior."""
+    """Whether a calibration unknown is more than 3.5 standard deviations from its prior mean."""
     is_far = jnp.asarray(False)
     for name, precision in (
         prior_of(solution.parameters, recording, solution.model)._asdict().items()
@@ -480,16 +483,18 @@ def _calibration_strained(solution: Solution, recording: Recording) -> Array:
 
 
 def has_outliers(residuals: Array, recording: Recording, robust: Any) -> Array:
-    """Whether single residuals (r, t, c) are far off where the fit counts them by their square.
+    """Whether isolated residuals (r, t, c) are outliers; False for fits with a robust loss.
 
-    Three at least and 0.3 % of all beyond five sigma, sigma from the median, their neighbours
-    within three: a model that lacks something leaves runs, not single samples.
+    An outlier is beyond five sigma (from the median of the absolute values) and its two neighbours
+    are within three: an incomplete model leaves runs of large residuals, not single ones. True for
+    at least three outliers that are 0.3 % of all residuals.
     """
     if robust is not None:
         return jnp.asarray(False)
     measured = (recording.present > 0)[..., None] & jnp.ones(residuals.shape, bool)
     if recording.saturated is not None:
-        # rates are the first channels; at a limit a residual may be zero
+        # The rates are the first three channels. Saturated ones are excluded: their one-sided
+        # residuals may be zero.
         measured = measured.at[..., :3].set(measured[..., :3] & (recording.saturated == 0))
     size = jnp.where(measured, jnp.abs(residuals), jnp.nan)
     scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
@@ -505,13 +510,13 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     if recording.omega is None or recording.wxyz is None:
         return jnp.asarray(False)
     measured, from_attitudes = _turns(recording, centred=options.bias)
-    # the proper rotation nearest to the correlation of both, and how much its mirror image gains
+    # the orthogonal matrix nearest to the correlation of both; hand is -1 for a reflection
     left_vectors, sizes, right_vectors = svd(jnp.einsum("rti,rtj->ij", measured, from_attitudes))
     hand = jnp.sign(jnp.linalg.det(left_vectors) * jnp.linalg.det(right_vectors))
     power = jnp.sum((measured @ left_vectors) ** 2, axis=(0, 1))
     power = power * jnp.sum((from_attitudes @ right_vectors.T) ** 2, axis=(0, 1))
-    # Directions that show: noise alone turns those in which both are hardly correlated, and of a
-    # body that turns about one axis the two others.
+    # Directions count only if both are correlated along them: elsewhere noise alone sets the
+    # singular vectors, as for the two transverse axes of a rotation about a fixed axis.
     shown = sizes > 0.5 * jnp.sqrt(power)
     shows_turn = shown[1] & (sizes[1] > 0.02 * sizes[0])
     inverted = shows_turn & shown[2] & (hand < 0) & (sizes[2] > 0.1 * sizes[1])
@@ -528,9 +533,9 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
 
 
 def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
-    """Turns between samples by the rates and by the attitudes (..., T-1, 3).
+    """Rotation vectors between samples (..., T-1, 3) by the rates and by the attitudes.
 
-    ``centred``: less their means, whose difference may be the gyroscope's bias.
+    ``centred``: minus their means, whose difference may be the gyroscope's bias.
     """
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
     measured, recorded = turns_of_rates(recording), turns_between_samples(recording)
@@ -545,7 +550,8 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
 def residuals_by_channel(
     linear: Linear, recording: Recording, robust: Huber | None
 ) -> dict[str, Array]:
-    """Residuals of rates, attitudes and forces, each (r, t, 3), over their noise."""
+    """Residuals of rates, attitudes and forces, each (r, t, 3), over their noise, before the
+    ``robust`` loss."""
     residuals = linear.residuals if robust is None else robust.inverse(linear.residuals)
     parts, channel = {}, 0
     kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
@@ -556,11 +562,11 @@ def residuals_by_channel(
     return parts
 
 
-@partial(jax.jit, static_argnames="lags")  # one program, not one for each operation
+@partial(jax.jit, static_argnames="lags")  # outside jit too, one program for all operations
 def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]
-    # recordings that only fill a batch up have no samples and count nothing
+    # recordings that only pad a batch have no samples and do not contribute
     total = jnp.where(total > 0, total, 1)
     residuals = (residuals - (jnp.sum(residuals, axis=1) / total)[:, None]) * present[..., None]
     power = jnp.sum(residuals**2, axis=1)
@@ -573,7 +579,7 @@ def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
             jax.lax.dynamic_slice_in_dim(x, lag, residuals.shape[1], axis=1)
             for x in (later, later_present)
         )
-        # without gaps the number of samples less the lag
+        # pairs of samples that are both present: without gaps the number of samples minus the lag
         pairs = jnp.sum(present * present_too, axis=1)[:, None]
         correlation = jnp.sum(residuals * lagged, axis=1) / safe
         terms = correlation**2 / jnp.where(pairs > 0, pairs, jnp.inf) * total * (total + 2)
@@ -581,8 +587,8 @@ def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
 
     statistics, counted = jax.lax.map(statistic_at, jnp.arange(1, lags + 1))
     statistic = jnp.sum(statistics)
-    # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
-    # take longer to compile than all else here.
+    # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact function
+    # would take longer to compile than the rest of this one.
     degrees = residuals.shape[-1] * jnp.sum(counted)
     has_pairs, degrees = degrees > 0, jnp.maximum(degrees, 1)
     spread = 2 / (9 * degrees)

@@ -13,8 +13,8 @@ from polhode.fit._recording import Recording
 
 
 class LoadedCsv(NamedTuple):
-    """A recording, the columns it was read from by role, and the units that their names state
-    (role -> unit; empty where no name does).
+    """A recording, the names of its columns by role, and the units that these names state (role ->
+    unit, only for columns with a unit).
     """
 
     recording: Recording
@@ -36,14 +36,14 @@ def read_recording(
     those it leaves out are recognised by their usual names (``t``, ``time_s``, ``wx``, ``gyro_x``,
     ``omega_x``, ``angular_velocity.x``, ...). ``scale`` multiplies the rates (pi/180 for deg/s),
     ``time_scale`` the times (1e-3 for ms); None: by the unit that the column's name states (in
-    brackets, or at its end), or 1. So are the speeds of ``wheel``, always by their column's name.
-    ``noise``, rad/s: standard deviation of the rates. An empty or
-    NaN cell makes its row a gap; one of ``wheel`` alone is interpolated linearly. Cells are
-    separated by commas, or, where the header has none, by semicolons or tabs, and may then have a
-    decimal comma. Lines before the header that are empty or start with # are skipped.
+    brackets, or at its end), or 1. The speeds of ``wheel`` are always scaled by the unit in their
+    column's name. ``noise``, rad/s: standard deviation of the rates. An empty or
+    NaN cell makes its row a gap; a missing ``wheel`` speed alone is interpolated linearly. Cells
+    are separated by commas, or, where the header has none, by semicolons or tabs, and may then have
+    a decimal comma. Lines before the header that are empty or start with # are skipped.
 
     Raises FileNotFoundError, and ValueError for a file that is not text, missing, ambiguous or
-    repeated columns, a ``scale`` of another unit than the columns state, cells that are no numbers,
+    repeated columns, a ``scale`` of another unit than the columns state, cells without a number,
     unsorted or repeated times (each with its line) and rates that appear to be in deg/s.
     """
     return load_recording(path, columns, scale=scale, time_scale=time_scale, noise=noise).recording
@@ -69,11 +69,11 @@ def load_recording(
     (header,) = csv.reader([lines[header_line]], delimiter=separator, skipinitialspace=True)
     names = [name.strip() for name in header]
     header_names = _required_columns(path, names, {} if columns is None else columns)
-    given = {"t": time_scale, "wx": scale, "wy": scale, "wz": scale}
+    factors = {"t": time_scale, "wx": scale, "wy": scale, "wz": scale}
     units = {
         role: unit
         for role, name in header_names.items()
-        if (unit := unit_of(role, name, is_scaled=given.get(role) is not None))
+        if (unit := unit_of(role, name, is_scaled=factors.get(role) is not None))
     }
     scale = _factor(path, "rates", [units.get(role) for role in ("wx", "wy", "wz")], _RATES, scale)
     time_scale = _factor(path, "times", [units.get("t")], _TIMES, time_scale)
@@ -100,7 +100,7 @@ def load_recording(
 
 
 def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dict[str, str]:
-    """The column of each role: the one given, or the one whose name is usual for it."""
+    """The column name of each role: from ``columns``, or else recognised as a usual name."""
     if unknown := sorted(set(columns) - {"t", "wx", "wy", "wz", "wheel"}):
         raise ValueError(
             f"columns names those of t, wx, wy, wz and wheel, got the keys {', '.join(unknown)}."
@@ -116,7 +116,7 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
     ]
     if missing_columns:
         raise ValueError(
-            f"{path} must have the columns asked for, missing: {', '.join(missing_columns)}; its "
+            f"{path} lacks requested columns: {', '.join(missing_columns)}; its "
             f"columns are: {', '.join(names) or 'none'}{_headless(names)}."
         )
     shared = [name for name in header_names.values() if [*header_names.values()].count(name) > 1]
@@ -136,7 +136,7 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
 
 
 def _rows(path, lines, header_line, separator, names, header_names) -> tuple[list, list[int]]:
-    """The numbers of the needed columns, and the line that each row stands in."""
+    """The numbers of the needed columns, and the line number of each row."""
     places = [names.index(name) for name in header_names.values()]
     table, numbers = [], []
     reader = csv.reader(lines[header_line + 1 :], delimiter=separator, skipinitialspace=True)
@@ -232,8 +232,8 @@ def _split_unit(name: str) -> tuple[str, str]:
 
 
 def unit_of(role: str, name: str, is_scaled: bool = False) -> str:
-    """The unit that a column's name states, or nothing. ValueError for one of another kind, and for
-    an unknown one in brackets unless a factor is given."""
+    """The unit that a column's name states, or an empty string. ValueError for a unit of another
+    quantity, and for an unknown unit in brackets unless a factor is given (``is_scaled``)."""
     unit = _split_unit(name)[1]
     unit = _SPELLINGS.get(unit, unit)
     factors = _TIMES if role == "t" else _RATES
@@ -269,7 +269,10 @@ def usual_column(path, role: str, names: list[str]) -> str | None:
 def _factor(
     path, what: str, units: list, factors: Mapping[str, float], given: float | None
 ) -> float:
-    """The factor that was given, or that of the one unit that columns state."""
+    """The factor ``given`` by the caller, or else that of the unit in the column names, or 1.
+
+    ValueError where these contradict each other or the unit is ambiguous.
+    """
     stated = sorted({str(unit) for unit in units if unit})
     if given is not None:
         meant = next((unit for unit, factor in factors.items() if factor == given), None)
@@ -293,7 +296,7 @@ def _lines(path) -> list[str]:
     """The text, line by line."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            begin = file.read(65536)  # what is no text may have no end
+            begin = file.read(65536)  # a NUL here ends the reading: binary streams may be endless
             lines = (begin if "\0" in begin else begin + file.read()).splitlines(keepends=True)
     except UnicodeDecodeError as error:
         raise ValueError(
@@ -305,7 +308,7 @@ def _lines(path) -> list[str]:
 
 
 def _headless(names: list[str]) -> str:
-    """A question, where the header looks like data."""
+    """A hint for an error message, where all column names are numbers."""
     try:
         [float(name) for name in names]
     except ValueError:

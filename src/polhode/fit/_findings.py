@@ -52,8 +52,8 @@ WARNINGS = {
     Finding.CALIBRATION: "scale factors, misalignment or bias of the gyroscope are more than 3.5"
     " standard deviations from its calibration: state a wider one, Gyroscope(scale_std=...,"
     " misalignment_std=...), or the model lacks something that they make up for",
-    Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may ask for"
-    " a value beyond",
+    Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may fit a"
+    " value beyond better",
 }
 SCENE_WARNINGS = WARNINGS | {
     Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
@@ -67,7 +67,7 @@ SCALE_UNKNOWN = (
     "Only ratios of moments are determined: free motion does not depend on the size of the inertia "
     "(null direction of the information matrix). A known wheel, torque or moment would fix it."
 )
-"""What a fit to free rates says of every body."""
+"""Warning of every fit to torque-free rates."""
 UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 """Findings that raise an error unless ``throw=False``."""
 
@@ -88,14 +88,14 @@ class Observability(NamedTuple):
 
 
 def shown_beside_prior(covariance: np.ndarray, std: np.ndarray) -> int:
-    """In how many directions of a value the data at least halve the variance of its prior;
-    ``covariance`` (n, n), ``std`` (n,) of the prior."""
+    """Number of directions of a value in which the data at least halve the variance of its prior;
+    ``covariance`` (n, n) of the fit, ``std`` (n,) of the prior."""
     return int(np.sum(np.linalg.eigvalsh(covariance / std[:, None] / std) < 0.5))
 
 
 def shown_of_gain(covariance: np.ndarray, std: np.ndarray) -> list[tuple[str, int, int]]:
-    """What the data show of the errors of a gain matrix: name, number of directions and how many
-    of them are shown. ``covariance`` (9, 9), row by row; ``std`` (3, 3) of the calibration."""
+    """Observability of the errors of a gain matrix: name, number of directions, and how many of
+    them the data show. ``covariance`` (9, 9), row by row; ``std`` (3, 3) of the calibration."""
     # symmetric and antisymmetric combinations of opposite entries
     stretch, turn = [], []
     for i in range(3):
@@ -123,4 +123,4 @@ def shown_of_gain(covariance: np.ndarray, std: np.ndarray) -> list[tuple[str, in
 
 
 class FitError(RuntimeError):
-    """A fit that must not be used as it is; the message gives the cause and what helps."""
+    """Raised for an unusable fit; the message states the cause and a remedy."""

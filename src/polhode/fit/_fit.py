@@ -48,16 +48,16 @@ def fit_inertia(
       right-handed sensor axes; ``wxyz`` (..., T, 4), attitudes body -> space; ``force_body``
       (..., T, 3) [m/s^2], the accelerometer; rows with NaN are gaps.
     - ``omega_noise`` [rad/s], ``attitude_noise`` [rad], ``force_noise`` [m/s^2]: standard
-      deviations, broadcast against the data, of everything that was recorded or of nothing. None:
-      the noise is estimated from the residuals, all channels having the same in these units.
+      deviations, broadcast against the data. Give them for every recorded channel or for none.
+      None: the noise is estimated from the residuals, as one number for all channels in SI units.
     - ``wheel_speed`` (..., T) [rad/s]: speed of a reaction wheel relative to the body, for
-      ``FitOptions(motion=SteppedMotion(spin_inertia))``, which takes it as exact; NaN where it is
-      not known.
+      ``FitOptions(motion=SteppedMotion(spin_inertia))``, which treats it as noise-free; NaN where
+      it was not measured.
     - ``options``: ``FitOptions``: motion, unknowns, loss, start and solver.
-    - ``throw``: whether a fit that must not be used raises FitError.
+    - ``throw``: whether an unusable fit (``Fit.is_usable``) raises FitError.
 
-    Returns a ``Fit`` with the leading axes of the data. Torque-free rates show only the ratios of
-    the moments (``Fit.scale_known``). Every iterate is a physical body. Left-handed axes are
+    Returns a ``Fit`` with the leading axes of the data. Torque-free rates determine only the ratios
+    of the moments (``Fit.scale_known``). Every iterate is a physical body. Left-handed axes are
     detected where attitudes are given; otherwise see ``Fit.mirror_inertia``.
 
     Needs float64 (``jax_enable_x64``). Raises RuntimeError in float32; ValueError for bad input and
@@ -81,7 +81,7 @@ def fit_inertia(
 
 
 def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
-    """The options with ``trust_noise`` as the noise of ``fit_inertia`` implies it."""
+    """The options with ``trust_noise=None`` replaced: True if ``fit_inertia`` was given a noise."""
     stated = [name for name, (noise, _, _) in channels.items() if noise is not None]
     if options.gyroscope is not None and options.gyroscope.noise_density > 0:
         require(
@@ -115,7 +115,7 @@ def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
 
 
 def _check_wheel(wheel: bool, options: FitOptions) -> None:
-    """ValueError for a wheel's speed without a motion, which gives it a meaning."""
+    """ValueError for wheel speeds without a ``motion``: only that states the wheel's inertia."""
     require(
         not wheel or options.motion is not None,
         "wheel_speed needs the wheel's spin inertia to mean a momentum: give"
@@ -151,7 +151,8 @@ def fit_recordings(
 def windows(recording: Recording, length: int) -> list[Recording]:
     """A recording (without batch) cut into windows of ``length`` samples sharing their ends.
 
-    The last one has those that remain, and of less than four the one before it is longer.
+    The last window has the remaining samples. If these are fewer than four, they are added to the
+    window before.
     """
     if not isinstance(recording, Recording):
         raise TypeError(f"recording must be a Recording, got {type(recording).__name__}.")
@@ -164,7 +165,10 @@ def windows(recording: Recording, length: int) -> list[Recording]:
 
 
 def _is_brief(recording: Recording, options: FitOptions, *_: Any) -> bool:
-    """Few samples of a motion whose time follows from their number; that of a scene does not."""
+    """Whether a fit takes little time: few samples, of a motion whose cost is set by their number.
+
+    The cost of a simulated scene is not.
+    """
     is_bounded = isinstance(options.motion, FreeMotion | SteppedMotion | None)
     return is_bounded and recording.times.size <= _policy.BRIEF_FIT
 
@@ -187,7 +191,7 @@ def fit_each(recording: Recording, options: FitOptions, conclude: Callable = con
 
 
 def _fit_one(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
-    """One body, its readings turned into rates by the sensor model."""
+    """The fit of one body, whose readings the sensor model first converts to rates."""
     recording = calibrate(recording, options.gyroscope or Gyroscope())
     return conclude(solve_fit(recording, options), recording, options)
 
@@ -198,8 +202,8 @@ def _fit_batch(recording: Recording, options: FitOptions, conclude: Callable) ->
     def fit(body_recording):
         return _fit_one(body_recording, options, conclude)
 
-    # A processor core fills its vector units with the samples of a few bodies; more at a time would
-    # only wait for the slowest of them.
+    # On a CPU the samples of a few bodies fill the SIMD lanes of a core. More bodies at a time
+    # would only iterate until the slowest of them has converged.
     count = recording.times.shape[0]
     at_once = max(
         1, _policy.FIT_SAMPLES // max(recording.times.shape[1] * recording.times.shape[2], 1)
@@ -233,8 +237,8 @@ def fit_scene(
     - ``scene``: with starting values, one body.
     - ``data``: a ``ph.fit.Recording``, whose leading axes are bodies that are fitted one by one; or
       a list of recordings of the same body.
-    - ``free``: function of the scene that returns the array or the list of arrays to fit (of a
-      part: all its arrays). The initial rates of each recording, and its initial attitude where
+    - ``free``: function of the scene that returns the array or the list of arrays to fit (a part
+      stands for all its arrays). The initial rates of each recording, and its initial attitude if
       attitudes were recorded, are always fitted too.
     - ``bounds``: for each array of ``free`` a pair of its lower and upper bound, numbers or arrays
       of its shape, None where there is none; None in place of a pair: no bounds. The starting
@@ -242,12 +246,12 @@ def fit_scene(
     - ``prior_std``: for each array of ``free`` the standard deviation of a normal prior about its
       starting value, a number or an array of its shape, or None.
     - ``attitude`` (4,): initial attitude ``wxyz``, for recordings without attitudes; None: the
-      body axes are those of space at the first time.
+      identity.
     - ``method``, ``rtol``: as in ``ph.simulate``.
-    - ``options``: ``FitOptions`` of which ``robust``, ``bias``, ``trust_noise``, ``gyroscope``
-      (the default is one of 1 % uncertain scale, which widens ``std``; without such errors give
-      ``Gyroscope.ideal()``), ``max_starts`` (2 at most: all data, then growing parts of them),
-      ``solver`` and ``max_steps`` apply.
+    - ``options``: ``FitOptions``, of which these apply: ``robust``, ``bias``, ``trust_noise``,
+      ``gyroscope`` (by default with scale factors and axes uncertain by 1 %, which widens ``std``;
+      for exact ones give ``Gyroscope.ideal()``), ``max_starts`` (at most 2 are used: all data,
+      then growing parts of them), ``solver`` and ``max_steps``.
     - ``throw``: whether a fit that is not finite or stopped early raises FitError.
 
     Returns a ``Fit``: ``values`` and ``std`` in the order of ``free``, ``scene`` with the values.
@@ -269,7 +273,7 @@ def fit_scene(
     for name in ("motion", "unknown", "initial_inertia"):
         require(
             getattr(options, name) is None,
-            f"fit_scene has no use for the option {name}: the scene is the model, and free selects"
+            f"fit_scene does not use the option {name}: the scene is the model, and free selects"
             " what is unknown.",
         )
     require(
@@ -382,7 +386,7 @@ def _start(attitude: ArrayLike | None, scene: Scene) -> Array | None:
 
 
 def _check_single(scene: Any) -> None:
-    """TypeError or ValueError for what is not the scene of one body."""
+    """TypeError or ValueError unless ``scene`` is a ``Scene`` of one body."""
     if not isinstance(scene, Scene):
         raise TypeError(f"scene must be a ph.Scene, got {type(scene).__name__}.")
     shapes = [shape for name in PARTS for shape in batch_shapes(getattr(scene, name))]

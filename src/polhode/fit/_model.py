@@ -34,20 +34,20 @@ from polhode.rotation import conjugate, multiply, normalise, rotate, wxyz_to_mat
 
 # Unconstrained unknowns of a fit, and the body that they describe.
 
-# Eigenvalues of the second moments, relative to their sum, around which a flat body is near.
+# Eigenvalues of the second moments below about this fraction of their sum: a nearly flat body.
 _SOFT = 5e-3
 
 
 def entries_of(tensor: Float[Array, "3 3"], count: int = 6) -> Float[Array, " e"]:
-    """The ``count`` unknown entries: xx, yy, zz and, of 6, yz, zx, xy; none where it is known."""
+    """The first ``count`` (0, 3 or 6) entries of a tensor in the order xx, yy, zz, yz, zx, xy."""
     a, b, c = tensor[0, 0], tensor[1, 1], tensor[2, 2]
     return jnp.stack([a, b, c, tensor[1, 2], tensor[2, 0], tensor[0, 1]])[:count]
 
 
 def whole_of(entries: Float[Array, " e"], count: int = 6) -> Float[Array, "3 3"]:
-    """The tensor of its ``count`` (3 or 6) entries, products zero where they are absent.
+    """The tensor with these ``count`` (3 or 6) entries; three entries: zero products.
 
-    Of none: any, for a motion that does not ask for it.
+    With no entries it is the identity, for motions that ignore the tensor.
     """
     if count == 0:
         return jnp.eye(3, dtype=entries.dtype)
@@ -55,7 +55,7 @@ def whole_of(entries: Float[Array, " e"], count: int = 6) -> Float[Array, "3 3"]
 
 
 def is_nearly_flat(tensor: Float[Array, "3 3"], moments: Float[Array, " 3"]) -> Array:
-    """Whether the smallest second moment is next to zero; ``moments``: ascending."""
+    """Whether the smallest second moment is nearly zero; ``moments``: ascending."""
     trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     return trace / 2 - moments[2] < 1e-4 * trace
 
@@ -63,14 +63,14 @@ def is_nearly_flat(tensor: Float[Array, "3 3"], moments: Float[Array, " 3"]) -> 
 class Parameters(eqx.Module):
     """Unconstrained unknowns of one body and its recordings (None: not fitted).
 
-    **Fields:** ``shape`` (k,): free entries of the Cholesky factor, relative to the start;
+    **Fields:** ``shape`` (k,): coordinates of the inertia tensor, zero at the starting body;
     ``omega`` (r, 3), rad/s: rates at the first time of each recording; ``attitude`` (r, 3), rad:
-    rotation vector (body axes) from the start attitude to the initial one; ``bias`` (3,), rad/s, of
-    the readings beside the calibrated one; ``mounting`` (3,), rad: rotation vector of the sensor
-    axes; ``lever`` (3,), m: accelerometer position from the centre of mass; ``motion``: the
-    motion's own unknowns; ``gain`` (9,): errors of the gyroscope's gain matrix relative to the
-    calibrated one, row by row; ``delay``, s, of its readings; ``walk`` (r, k, 3), rad/s: changes of
-    its bias over each of k equal parts of a recording.
+    rotation vector (body axes) from the first recorded attitude to the initial one; ``bias`` (3,),
+    rad/s, of the readings, added to the calibrated one; ``mounting`` (3,), rad: rotation vector of
+    the sensor axes; ``lever`` (3,), m: accelerometer position from the centre of mass; ``motion``:
+    the motion's own unknowns; ``gain`` (9,): errors of the gyroscope's gain matrix relative to the
+    calibrated one, row by row; ``delay``, s, of the readings, added to the calibrated one; ``walk``
+    (r, k, 3), rad/s: changes of the bias over each of k equal parts of a recording.
     """
 
     shape: Float[Array, " k"]
@@ -86,40 +86,40 @@ class Parameters(eqx.Module):
 
 
 class AbstractInertiaUnknown(eqx.Module):
-    """Which inertias are possible: entries of the second moments that are free."""
+    """Which directions of the inertia tensor are unknown."""
 
     @abc.abstractmethod
     def columns(self) -> np.ndarray:
-        """Free directions (6, k) of the six entries (three diagonal ones first), orthonormal."""
+        """Unknown directions (6, k), orthonormal, of six entries (three diagonal ones first)."""
 
 
 class FullTensor(AbstractInertiaUnknown):
-    """Any tensor in sensor axes: six numbers, of which free motion shows five."""
+    """Any tensor in sensor axes: six numbers, of which torque-free rates determine five."""
 
     def columns(self) -> np.ndarray:
         return np.eye(6)
 
 
 class MomentsOnly(AbstractInertiaUnknown):
-    """Sensor axes are principal axes: three numbers, of which free motion shows two."""
+    """Sensor axes are principal axes: three numbers, of which torque-free rates determine two."""
 
     def columns(self) -> np.ndarray:
         return np.eye(6)[:, :3]
 
 
 class NoInertia(AbstractInertiaUnknown):
-    """The inertia is not unknown, or belongs to the unknowns of the motion."""
+    """The inertia is known, or belongs to the unknowns of the motion."""
 
     def columns(self) -> np.ndarray:
         return np.zeros((6, 0))
 
 
-# scaling a body changes its ratios not at all: with the size unknown the sum is kept
+# Direction of the trace. It is fixed where the data determine the ratios of the moments only.
 SCALE = np.array([1, 1, 1, 0, 0, 0]) / np.sqrt(3)
 
 
 def free_columns(unknown: AbstractInertiaUnknown, scale_known: bool) -> np.ndarray:
-    """Directions that the data can show: all, or those at right angles to the scale."""
+    """Directions that the data can determine: all, or those orthogonal to ``SCALE``."""
     columns = unknown.columns()
     if scale_known:
         return columns
@@ -129,10 +129,10 @@ def free_columns(unknown: AbstractInertiaUnknown, scale_known: bool) -> np.ndarr
 
 
 class Base(NamedTuple):
-    """Where ``Parameters.shape`` counts from.
+    """Origin of the coordinates ``Parameters.shape``.
 
     ``entries`` (6,): of a symmetric matrix S (diagonal, then yz, zx, xy), kg m^2; ``soft``, kg m^2:
-    the size of its eigenvalues below which the second moments bend away from zero.
+    eigenvalues of S below about this size are mapped to larger, positive second moments.
     """
 
     entries: Float[Array, " 6"]
@@ -140,7 +140,7 @@ class Base(NamedTuple):
 
 
 def base_of(sigma: Float[Array, "3 3"], scale_known: bool) -> Base:
-    """The base whose tensor at ``shape = 0`` has second moments ``sigma``, or their shape."""
+    """The base whose tensor at ``shape = 0`` has second moments ``sigma``, up to a factor."""
     total = sigma[0, 0] + sigma[1, 1] + sigma[2, 2]
     if not scale_known:
         sigma, total = sigma / total, jnp.ones_like(total)
@@ -153,20 +153,21 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
     """Inertia tensor (3, 3) at ``shape``: physical for any real numbers.
 
     Second moments ``(S + sqrt(S^2 + soft^2)) / 2`` of a symmetric matrix S that is linear in
-    ``shape``. Away from flat bodies that is S itself: what data leave undetermined is a straight
-    valley in the entries of the tensor, and a curved one in those of a Cholesky factor, where an
-    optimiser crawls. Towards minus infinity an eigenvalue leads to a flat body.
+    ``shape``. Away from flat bodies they equal S, so a direction that the data do not determine is
+    a straight valley of the misfit. In the entries of a Cholesky factor it would be a curved one,
+    which forces an optimiser to short steps. As an eigenvalue of S goes to minus infinity the body
+    becomes flat.
     """
     scale = base.soft / _SOFT
     y = base.entries + scale * jnp.sum(jnp.asarray(columns, shape.dtype) * shape[None], axis=1)
     values, axes, (yz, zx, xy) = principal(whole_of(y))
     root = jnp.sqrt(values**2 + base.soft**2)
-    # without cancellation for negative eigenvalues
+    # the second form avoids cancellation for negative eigenvalues
     positive = jnp.where(values > 0, (values + root) / 2, base.soft**2 / (2 * (root - values)))
 
     def slope(i, j):
-        # divided difference of the function above; the products that it multiplies are zero, and
-        # carry the tangent of turning axes
+        # Divided difference of ``positive``. The products that it multiplies are zero; their
+        # tangents are those of the rotating principal axes.
         return (1 + (values[i] + values[j]) / (root[i] + root[j])) / 2
 
     body_moments = symmetric(positive, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
@@ -188,11 +189,11 @@ class Predicted(NamedTuple):
 
 
 class AbstractMotion(eqx.Module):
-    """A motion from initial rates (and attitude) on, for one body and one recording."""
+    """Model of the motion of one body in one recording, from initial rates (and attitude)."""
 
     @abc.abstractmethod
     def start(self) -> Any:
-        """Starting values (a pytree of arrays) of the unknowns of this motion; None without."""
+        """Starting values (a pytree of arrays) of this motion's unknowns; None: it has none."""
 
     @abc.abstractmethod
     def fixes_scale(self) -> bool:
@@ -200,11 +201,11 @@ class AbstractMotion(eqx.Module):
 
     @property
     def has_bounds(self) -> bool:
-        """Whether ``bounded`` is more than the identity."""
+        """Whether ``bounded`` differs from the identity."""
         return False
 
     def bounded(self, unknown: Any) -> Any:
-        """Values of the motion's unknowns from numbers that may be anything."""
+        """Values of the motion's unknowns, within their bounds, from unconstrained numbers."""
         return unknown
 
     def unbounded(self, values: Any) -> Any:
@@ -221,11 +222,11 @@ class AbstractMotion(eqx.Module):
 
     @property
     def scales(self) -> bool:
-        """Whether ``over`` is known."""
+        """Whether ``over`` is implemented for the unknowns of this motion."""
         return not jax.tree.leaves(self.start())
 
     def over(self, unknown: Any, size: Array) -> Any:
-        """The unknowns that with an inertia divided by ``size`` give the same motion, linear in
+        """The unknowns that give the same motion with an inertia divided by ``size``; linear in
         ``unknown``."""
         return unknown
 
@@ -247,7 +248,7 @@ class AbstractMotion(eqx.Module):
 
 
 class Drag(eqx.Module):
-    """Isotropic torque of the air, ``-(linear + quadratic |omega|) omega``.
+    """Isotropic drag torque, ``-(linear + quadratic |omega|) omega``.
 
     **Fields:** ``linear`` [N m s], ``quadratic`` [N m s^2].
     """
@@ -256,7 +257,8 @@ class Drag(eqx.Module):
     quadratic: Array | float = 0.0
 
     def torque(self, dtype: DTypeLike) -> AbstractTorque:
-        """The torque in a scene; a fit may try negative coefficients, which a scene refuses."""
+        """The torque of a scene. ``tree_at`` sets the coefficients, because the constructors reject
+        negative ones, which a fit may try."""
         parts = LinearDamping(1.0) + QuadraticDamping(1.0)
         coefficients = [jnp.full(3, c, dtype) for c in (self.linear, self.quadratic)]
         return eqx.tree_at(lambda s: [term.c for term in s.terms], parts, coefficients)
@@ -268,7 +270,7 @@ def _three_floats(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 class SteppedMotion(AbstractMotion):
-    """Flight with air drag and a reaction wheel of known speed, by Runge-Kutta steps of order 4.
+    """Motion with drag and a reaction wheel of known speed, by Runge-Kutta steps of order 4.
 
     **Fields:** ``spin_inertia`` [kg m^2] of the wheel about its ``axis`` (3,), a unit vector in
     sensor axes (None: no wheel): its momentum is ``spin_inertia`` times the speed W(t - ``delay``)
@@ -347,7 +349,7 @@ class SteppedMotion(AbstractMotion):
             attitude = normalise(jnp.stack(attitude, axis=-1))
         if not acceleration:
             return Predicted(rates, None, attitude)
-        if wheel_at is not None:  # what the wheel takes up does not turn the body
+        if wheel_at is not None:  # momentum that the wheel takes up does not accelerate the body
             carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
             momentum_change, step = (jnp.asarray(jnp.gradient(x, axis=0)) for x in (carried, times))
             push = push - momentum_change / step[:, None]
@@ -365,7 +367,8 @@ class SteppedMotion(AbstractMotion):
 
 
 def _parabola(ts: Array, values: Array) -> Callable[[Array], Array]:
-    """Through a step's two ends and its middle, where alone it is asked: no look-up in a table."""
+    """The parabola through the values at the ends and the middle of a step. A Runge-Kutta step
+    evaluates it only there, so that no interpolation in the table is compiled into the step."""
     first, middle, last = values
 
     def at(t):
@@ -376,14 +379,14 @@ def _parabola(ts: Array, values: Array) -> Callable[[Array], Array]:
 
 
 def free_acceleration(inertia: Inertia, omega: Float[Array, "t 3"]) -> Float[Array, "t 3"]:
-    """d(omega)/dt of the free body."""
+    """d(omega)/dt of the torque-free body."""
     dynamics = Dynamics(Hamiltonian(inverse_inertia(inertia), inertia))
     push, _ = momentum_rate(0.0, components(inertia.momentum(omega)), None, dynamics)
     return inertia.rates(jnp.stack(push, axis=-1))
 
 
 def _attitude() -> Attitude:
-    """An attitude without rows, for a drag and a wheel do not depend on it."""
+    """A placeholder without rows: drag and a wheel do not depend on the attitude."""
     return from_rows({})
 
 
@@ -434,8 +437,8 @@ class FreeMotion(AbstractMotion):
 def _combined(matrix: Float[Array, "n n"], components: tuple[Array, ...]) -> Float[Array, "t n"]:
     """``matrix`` times a vector of components that are arrays over time.
 
-    As a loop over the rows, for what a loop reads is worked out once: written as one expression,
-    the compiler would repeat the whole motion for every component of the result.
+    It loops over the rows because XLA evaluates the inputs of a loop once. In a single expression
+    it would fuse the whole motion into every component of the result.
     """
 
     def row(weights):
@@ -463,7 +466,7 @@ def simulated(
     rtol: float | None,
     attitude: Float[Array, " 4"] | None = None,
 ) -> Predicted:
-    """The motion by ``ph.simulate``; without ``wxyz`` from ``attitude``, or from the space axes."""
+    """The motion by ``ph.simulate`` from ``wxyz``, else ``attitude``, else the identity."""
     axes = jnp.asarray([1, 0, 0, 0])
     start = next(x for x in (wxyz, attitude, axes) if x is not None).astype(omega.dtype)
     trajectory = simulate(scene, State(start, omega), times, method, rtol=rtol, throw=False)
@@ -474,10 +477,10 @@ class SceneMotion(AbstractMotion):
     """Motion of the scene ``build(inertia, unknown)``, by ``ph.simulate``.
 
     **Fields:** ``build`` makes a ``ph.Scene`` of an inertia and the motion's own unknowns;
-    ``unknown``: a pytree of their starting values, not zero where their size matters (it sets the
-    optimiser's unit), or None; ``shows_scale``: whether rates depend on the absolute size of the
+    ``unknown``: a pytree of their starting values, or None (the magnitudes of nonzero values are
+    the optimiser's units); ``shows_scale``: whether rates depend on the absolute size of the
     inertia, true for known torques, rotors with known momentum and potentials; ``method``: one
-    that forward derivatives pass, by default steps of LiePoisson; ``rtol`` as in ``ph.simulate``.
+    with forward-mode derivatives, by default ``LiePoisson()``; ``rtol`` as in ``ph.simulate``.
 
     A scene whose forces depend on the attitude needs attitudes in the recording, or starts from
     the space axes. Accelerometer readings are not modelled.
@@ -510,13 +513,12 @@ class SceneMotion(AbstractMotion):
 
 
 class LeafMotion(AbstractMotion):
-    """Motion of a scene some of whose arrays are unknown, by ``ph.simulate``.
+    """Motion of a scene with some unknown arrays, by ``ph.simulate``.
 
     **Fields:** ``scene``, with the starting values; ``places`` (static): which of its leaves are
     unknown; ``bounds``: lower and upper ends of each, infinite where there is none, or None;
-    ``widths``: standard deviations of normal priors about the start; ``attitude`` (4,): initial one
-    for recordings without attitudes; ``method`` and
-    ``rtol`` as in ``ph.simulate``.
+    ``widths``: standard deviations of normal priors about the start; ``attitude`` (4,): initial
+    attitude for recordings without attitudes; ``method`` and ``rtol`` as in ``ph.simulate``.
     """
 
     scene: Scene

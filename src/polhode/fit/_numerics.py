@@ -17,18 +17,18 @@ from jaxtyping import Array
 
 from polhode import _policy
 
-# Faster compilation of fits, by options of the compiler.
+# Compiler options that shorten the compilation of fits.
 
-# XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
-# time. The jaxlib of jax 0.10 knows the option, that of 0.12 no longer.
+# XLA's older loop emitters: programs of fits run as fast and compile in half the time. The jaxlib
+# of jax 0.10 has the option, that of 0.12 no longer.
 _OLDER_LOOPS = {"xla_cpu_use_fusion_emitters": False}
-# Without LLVM's optimisations the first fit of a recording takes 12 s of processor time in place of
-# 18, and every later one of 400 samples 34 ms in place of 8.
+# Without LLVM's optimisations the first fit of a recording takes 12 s of processor time instead of
+# 18, and every later one of 400 samples 34 ms instead of 8.
 _BRIEF = {"xla_backend_optimization_level": 0}
 
 
 def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
-    """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit.
+    """``eqx.filter_jit`` that compiles faster on CPUs, where this is the outermost jit.
 
     ``is_brief``: whether a call with these arguments takes so little time that the program need not
     be optimised.
@@ -39,9 +39,9 @@ def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
 
         @functools.cache
         def outermost_jit(brief: bool) -> Callable:
-            wanted = _OLDER_LOOPS | (_BRIEF if brief else {})
-            known = {name: value for name, value in wanted.items() if _is_known(name, value)}
-            options: dict[str, Any] = {"compiler_options": known}
+            candidates = _OLDER_LOOPS | (_BRIEF if brief else {})
+            supported = {k: value for k, value in candidates.items() if _is_supported(k, value)}
+            options: dict[str, Any] = {"compiler_options": supported}
             return eqx.filter_jit(function, **options)
 
         @functools.wraps(function)
@@ -57,8 +57,8 @@ def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
 
 
 @functools.cache
-def _is_known(name: str, value: Any) -> bool:
-    """Whether this jaxlib knows an option."""
+def _is_supported(name: str, value: Any) -> bool:
+    """Whether this jaxlib accepts a compiler option."""
     try:
         jax.jit(lambda x: -x, compiler_options={name: value})(1.0)
     except (JaxRuntimeError, ValueError):
@@ -68,17 +68,17 @@ def _is_known(name: str, value: Any) -> bool:
 
 # LAPACK calls for one matrix at a time: batched calls can deadlock.
 #
-# The jaxlib of jax 0.10 hands the matrices of a batch to the threads that run the program and waits
-# for them on one of these threads. When as many calls run at a time as there are threads (two on a
-# machine of two cores), each waits for the others and none returns. Single matrices are not handed
-# to other threads.
+# The jaxlib of jax 0.10 distributes the matrices of a batch over the thread pool that runs the
+# program, and blocks one of these threads until they are done. When as many calls run at a time as
+# there are threads (two on a machine of two cores), all threads are blocked and no call returns.
+# Single matrices are computed on the calling thread.
 
-# The jaxlib of jax 0.12 works through a batch where it is.
+# The jaxlib of jax 0.12 computes a batch on the calling thread.
 _AFFECTED = jax.__version_info__ < (0, 12)
 
 
 def _one_matrix_at_a_time(signature: str) -> Callable:
-    """``function`` of single matrices for batches of them too, one after the other."""
+    """Decorator that extends a function of single matrices to batches, one after the other."""
 
     def decorate(function: Callable) -> Callable:
         looped = jax.custom_batching.sequential_vmap(function)
@@ -114,9 +114,9 @@ def inverse(matrix: Array) -> Array:
     """Inverses of matrices (..., n, n), with derivatives in both modes."""
     constant_matrix = jax.lax.stop_gradient(matrix)
     result = _inverse(constant_matrix)
-    return (
-        result - result @ (matrix - constant_matrix) @ result
-    )  # loops of single matrices have none
+    # The correction is zero and has the derivative of the inverse: ``sequential_vmap`` does not
+    # support reverse mode.
+    return result - result @ (matrix - constant_matrix) @ result
 
 
 @_one_matrix_at_a_time("(n,n)->(n,n),(n),(n,n)")
@@ -133,7 +133,7 @@ def triangle(matrix: Array) -> Array:
 
 @_one_matrix_at_a_time("(m,n),(m)->(n)")
 def least_squares(matrix: Array, right: Array) -> Array:
-    """The x (..., n) that makes ``matrix x - right`` smallest; columns independent, m > n."""
+    """The x (..., n) that minimises ``|matrix x - right|``; columns independent, m > n."""
     count = matrix.shape[1]
     factor = jnp.linalg.qr(jnp.concatenate([matrix, right[:, None]], axis=1), mode="r")
     return jax.scipy.linalg.solve_triangular(factor[:count, :count], factor[:count, count])
@@ -163,18 +163,18 @@ class LeastSquares(lx.AbstractLinearSolver):
 
 # Levenberg-Marquardt steps of Optimistix with a termination criterion in units of the noise.
 
-# Squared derivatives (of a data vector of norm ten by unknowns of order one) that count as none.
-_FAINT = 1e-6
+# Squared derivatives (of a data vector of norm ten by unknowns of order one) that count as zero.
+_NEGLIGIBLE = 1e-6
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """Levenberg-Marquardt that stops when the optimum is near beside its own uncertainty.
+    """Levenberg-Marquardt that stops within a fraction of the standard deviations of the optimum.
 
-    A step is not worth making when the part of the residuals that the linear model can still
-    remove is ``offset`` of what it cannot, each per degree of freedom (the relative offset of Bates
-    and Watts, Technometrics 23 (1981) 179): the estimate is then within about ``offset`` standard
-    deviations of the optimum, in every direction, however long the valley. ``floor`` is the part of
-    the residuals, relative to a data vector of norm ten, that counts as rounding.
+    It stops when the part of the residuals that the linear model can still remove is ``offset``
+    times the part that it cannot, each per degree of freedom (the relative offset of Bates and
+    Watts, Technometrics 23 (1981) 179). The estimate is then within about ``offset`` standard
+    deviations of the optimum in every direction, also along a narrow valley of the misfit. A
+    removable part of a norm below ``floor`` counts as rounding error (the data have norm ten).
     """
 
     offset: float
@@ -189,11 +189,12 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     def __init__(self, offset: float, floor: float):
         self.offset = offset
         self.floor = floor
-        # the usual criterion stays as the other way to end
+        # the criterion of Optimistix, which ``terminate`` applies as well
         self.rtol = self.atol = floor
         self.norm = optx.max_norm
         self.descent = optx.DampedNewtonDescent(linear_solver=LeastSquares())
-        # For long valleys: enlarged as soon as the linear model is a fair guide
+        # Faster along narrow valleys: the trust region grows fourfold as soon as a step achieves
+        # 0.75 of the predicted decrease (by default 3.5-fold at 0.99).
         self.search = optx.ClassicalTrustRegion(0.75, 0.1, 4.0, 0.25)
         self.verbose = _silent
 
@@ -203,8 +204,8 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         square, slope = jacobian.T @ jacobian, jacobian.T @ residual
         size = jnp.sqrt(jnp.diagonal(square))
         size = jnp.where(size > 0, size, 1)
-        # A direction that the data hardly show, as towards a flat body, is not waited for.
-        ridge = 30 * jnp.finfo(residual.dtype).eps * size.shape[0] + _FAINT / size**2
+        # The ridge excludes directions that the data hardly determine, such as towards a flat body.
+        ridge = 30 * jnp.finfo(residual.dtype).eps * size.shape[0] + _NEGLIGIBLE / size**2
         square = square / size[:, None] / size[None] + jnp.diag(ridge)
         slope = slope / size
         gain = slope @ solve(square, slope)
@@ -214,15 +215,15 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
 
 
 def _silent(**_):
-    """No output while it runs."""
+    """``verbose`` of Optimistix without output."""
 
 
 class ClassicalRungeKutta(diffrax.AbstractSolver):
-    """Runge and Kutta's rule of order 4: four evaluations a step, written out.
+    """The classical Runge-Kutta method of order 4, with its four stages written out.
 
-    No error estimate; conserves nothing exactly. Forward and reverse mode pass through its steps.
-    diffrax's own tables keep their stages in an array, which for a body's seven numbers costs more
-    than the stages do. Source: W. Kutta, Z. Math. Phys. 46 (1901) 435.
+    No error estimate; conserves nothing exactly. Its steps are differentiable in both modes.
+    diffrax's own Runge-Kutta solvers store the stages in an array, which for a body's seven numbers
+    costs more than the stages do. Source: W. Kutta, Z. Math. Phys. 46 (1901) 435.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -258,19 +259,20 @@ class ClassicalRungeKutta(diffrax.AbstractSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
-# Bounds of unknowns: maps from numbers that may be anything, and their curvature in a fit.
+# Bounds of unknowns: maps from unconstrained numbers, and their curvature in a fit.
 
-_BENT = 0.02
-"""Distance from a bound within which values are bent, over that of the start."""
+_CURVED_PART = 0.02
+"""Distance from a bound within which its map is curved, over the distance of the start from it."""
 
 
 def to_bounded(number: Array, start: Array, low: Array, high: Array) -> Array:
-    """A value between its bounds; any number may be given.
+    """A value between its bounds, from any real number.
 
-    At one bound a hyperbola, ``low + sqrt(s^2 + number^2) - s``: a straight line but for a parabola
-    near the bound, where steps may arrive from either side. A smooth maximum, flat beyond the bound
-    and bent as far from it as the start, took hundreds of steps: of 24 recordings of a body without
-    one of two kinds of drag it found 3 in time, this finds all. At two bounds a sigmoid.
+    With one bound a hyperbola, ``low + sqrt(s^2 + number^2) - s``: a straight line away from the
+    bound and a parabola near it, so that steps may reach the bound from either side. A smooth
+    maximum, which is flat beyond the bound and curved as far from it as the start is, needs
+    hundreds of steps: of 24 fits of drag to recordings of a body without one of its two kinds, 3
+    converged within the step limit, with the hyperbola all. With two bounds a sigmoid.
     """
     side, end, soft, has_bound = _one_sided(start, low, high)
     half, middle, has_both = _two_sided(low, high)
@@ -299,23 +301,23 @@ def _two_sided(low: Array, high: Array) -> tuple[Array, Array, Array]:
 
 
 def _one_sided(start: Array, low: Array, high: Array) -> tuple[Array, Array, Array, Array]:
-    """Of one bound the sign of values inside, the bound, the distance within which values are bent,
-    and whether there is one."""
+    """For one bound: the sign of the permitted side, the bound, the distance within which the map
+    is curved, and whether there is a bound."""
     side = jnp.where(jnp.isfinite(low), 1, -1)
     has_bound = jnp.isfinite(low) | jnp.isfinite(high)
     end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
-    # any positive number where there is no bound, for finite derivatives of what is not chosen
-    return side, end, jnp.where(has_bound, _BENT * jnp.abs(start - end), 1), has_bound
+    # without a bound any positive number: derivatives must be finite in the branch not selected too
+    return side, end, jnp.where(has_bound, _CURVED_PART * jnp.abs(start - end), 1), has_bound
 
 
 def curvature_rows(bounded: Callable, scaled: Any, scale: Any, cost_at: Callable) -> list[Array]:
     """Residuals of value zero that add the curvature of the bounds to Gauss-Newton steps.
 
-    Of a cost C(x(n)), x the bounded value of a number n, the second derivative is x'^2 C'' + x''
-    C'. Steps know the first term only, and where C' presses x against its bound, as a parabola in
-    n, that vanishes with n: they would go to and fro across it (8 of the 24 recordings of
-    ``to_bounded`` stopped at the limit). ``bounded``: x of n, elementwise; ``scaled`` times
-    ``scale``: the present n; ``cost_at``: C near them, a function of x.
+    A cost C(x(n)), x the bounded value of a number n, has the second derivative x'^2 C'' + x'' C'.
+    Gauss-Newton steps contain the first term only. Where C' drives x towards its bound, x is a
+    parabola in n and that term vanishes with n, so that steps would alternate between both sides of
+    the bound (8 of the 24 fits of ``to_bounded`` reached the step limit). ``bounded``: the map
+    x(n), elementwise; ``scaled`` times ``scale``: the present n; ``cost_at``: C as a function of x.
     """
     numbers = jax.tree.map(lambda a, b: a.astype(b.dtype) * b, scaled, scale)
     numbers = jax.lax.stop_gradient(numbers)

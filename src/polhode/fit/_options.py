@@ -21,7 +21,7 @@ from polhode.inertia import Inertia
 
 # Number of pieces of a recording in which the walk of the bias is linear.
 WALK_KNOTS = 16
-# A bound that readings reach: relative tolerance.
+# Relative distance from ``max_rate`` within which a reading counts as saturated.
 _AT_LIMIT = 1e-9
 
 
@@ -37,13 +37,14 @@ class Gyroscope(eqx.Module):
       deviation ``noise_density / sqrt(step)``, in fits with the median step of the recording.
     - ``bias_walk`` [rad/s/sqrt(s)]: random walk of the bias (rate random walk).
     - ``max_rate`` [rad/s]: readings saturate at plus and minus this rate; None: no limit is known.
-    - ``delay`` [s] of the readings behind their time stamps, beside attitudes or a wheel.
+    - ``delay`` [s] of the readings relative to their time stamps; in fits only with attitudes or a
+      wheel, without which rates do not determine it.
     - ``jitter`` [s]: standard deviation of independent errors of the time stamps.
     - ``scale_std``, ``misalignment_std`` [rad], ``bias_std`` [rad/s], ``delay_std`` [s]: standard
-      deviations of the calibration. A fit estimates what is not zero with a normal prior of that
-      width. The defaults are 1 % for ``scale_std`` and ``misalignment_std``, as data sheets of MEMS
-      gyroscopes state, and zero for the others. Misalignments include rotations of the sensor.
-      Errors of the gain are relative to the calibrated one, ``gain (1 + errors)``.
+      deviations of the calibration. A fit estimates the errors whose deviation is not zero, with a
+      normal prior. The defaults are 1 % for ``scale_std`` and ``misalignment_std``, as in data
+      sheets of MEMS gyroscopes, and zero for the others. Misalignments include rotations of the
+      sensor. Errors of the gain are relative to the calibrated one, ``gain (1 + errors)``.
 
     The terms are those of IEEE Std 952-1997, annex C. ``read`` simulates readings;
     ``FitOptions(gyroscope=...)`` uses the model in a fit.
@@ -177,7 +178,7 @@ def _at(
 def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
     """The recording in rates instead of readings, with the noise that the sensor model implies.
 
-    Readings at the limit are marked in ``Recording.saturated``: a fit takes them as bounds.
+    Readings at the limit are marked in ``Recording.saturated``; a fit treats them as bounds.
     Works on recordings with any leading axes, under jit and vmap.
     """
     if recording.omega is None:
@@ -211,27 +212,28 @@ def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
 
 
 def _limits_of_rates(limits: Array, present: Array, back: Array) -> tuple[Array, Array]:
-    """``saturated`` of the rates ``back`` times readings, and which samples remain.
+    """``saturated`` for the rates ``back @ readings``, and ``present`` of the remaining samples.
 
-    Where each rate is that of one reading, a tenth of others aside, it has the bounds of that one.
-    Of other matrices a sample with a saturated reading bounds no rate: it is a gap.
+    If one reading dominates each rate (the other weights sum to less than a tenth of its weight),
+    the rate inherits the limits of that reading. Otherwise a saturated reading bounds no single
+    rate, and its sample becomes a gap.
     """
     size = jnp.abs(back)
-    own = size == jnp.max(size, axis=1, keepdims=True)
-    of_rates = jnp.einsum("ij,...j->...i", jnp.where(own, jnp.sign(back), 0), limits)
+    is_dominant = size == jnp.max(size, axis=1, keepdims=True)
+    of_rates = jnp.einsum("ij,...j->...i", jnp.where(is_dominant, jnp.sign(back), 0), limits)
     has_own_bounds = jnp.all(jnp.sum(size, axis=1) < 1.1 * jnp.max(size, axis=1))
     is_bound = jnp.any(limits != 0, axis=-1)
-    kept = jnp.where(is_bound & ~has_own_bounds, jnp.zeros_like(present), present)
-    return jnp.where(has_own_bounds, of_rates, jnp.zeros_like(of_rates)), kept
+    remaining = jnp.where(is_bound & ~has_own_bounds, jnp.zeros_like(present), present)
+    return jnp.where(has_own_bounds, of_rates, jnp.zeros_like(of_rates)), remaining
 
 
 def saturation(recording: Recording, max_rate: float | None = None) -> Float[Array, "*b t 3"]:
     """1 for readings at an upper limit of their axis, -1 at a lower one, else 0.
 
-    With ``max_rate`` those are the readings of that size. Without it an axis counts as saturated
-    if at least four samples and 1 % of all are equal to its extreme value, and five times as many
-    as to the next value: a coarse digitisation repeats both. An upper limit is positive and a
-    lower one negative; a rate that varies by a few steps of the digitisation is at none.
+    With ``max_rate`` these are the readings of that magnitude. Without it an axis counts as
+    saturated if at least four samples and 1 % of all equal its extreme value, and five times as
+    many as equal the next value (coarse digitisation repeats both). An upper limit is positive and
+    a lower one negative; an axis that varies by less than four digitisation steps has no limit.
     """
     omega = recording.omega
     if omega is None:
@@ -253,7 +255,7 @@ def saturation(recording: Recording, max_rate: float | None = None) -> Float[Arr
         count = jnp.sum(equal.astype(dtype), axis=-2)
         others = jnp.sum(((below == second_greatest) & jnp.isfinite(below)).astype(dtype), axis=-2)
         is_enough = (count >= 4) & (count >= 0.01 * samples)
-        # of a constant rate there are no others, or rounding errors only
+        # a constant rate has no second value, or one that differs by rounding error only
         top, second = greatest[..., 0, :], second_greatest[..., 0, :]
         extent = top - jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
         varies = jnp.isfinite(second) & (extent > 1e-6 * size) & (extent >= 4 * (top - second))
@@ -280,13 +282,13 @@ class Huber(eqx.Module):
         return jnp.where(inside, residual, jnp.sign(residual) * outside)
 
     def inverse(self, reduced: Array) -> Array:
-        """The residual of which the loss makes ``reduced``."""
+        """The residual that the loss maps to ``reduced``."""
         size = jnp.abs(reduced)
         outside = (size**2 + self.threshold**2) / (2 * self.threshold)
         return jnp.where(size <= self.threshold, reduced, jnp.sign(reduced) * outside)
 
 
-# Options of a fit, and checks of which of them a function supports.
+# Options of a fit, and checks that they apply to a function and a recording.
 
 
 class FitOptions(eqx.Module):
@@ -303,14 +305,14 @@ class FitOptions(eqx.Module):
     - ``robust``: ``Huber(threshold)``, the loss of residuals beyond ``threshold`` standard
       deviations of the noise; None: least squares.
     - ``gyroscope``: ``Gyroscope``, the sensor model and how well it is calibrated; None:
-      ``Gyroscope()``, scale factors and misalignment to 1 %. ``Gyroscope.ideal()`` takes them as
-      exact, as simulated rates are; of a real sensor the intervals are then far too narrow.
+      ``Gyroscope()``, scale factors and misalignment to 1 %. ``Gyroscope.ideal()`` treats them as
+      exact, which suits simulated rates; with a real sensor the intervals are then far too narrow.
     - ``bias``: whether a constant bias of the gyroscope is fitted, with no prior.
     - ``mounting``: whether a rotation between the axes of the gyroscope and those of the attitudes
       is fitted.
-    - ``trust_noise``: whether the standard deviations of the recording are absolute (True) or only
-      their ratios count and the level is estimated from the residuals (False). None: True where
-      ``fit_inertia`` gets a noise, else False.
+    - ``trust_noise``: whether the standard deviations of the recording are absolute (True), or only
+      their ratios are used and their level is estimated from the residuals (False). None: True if
+      ``fit_inertia`` is given a noise or ``gyroscope`` has a ``noise_density``, else False.
     - ``max_starts``: maximum number of starting points. 1: the regression only. Further ones are
       used where the residuals exceed the noise: a second regression, growing parts of the
       recording, other bodies.
@@ -387,7 +389,7 @@ def checked_options(options: FitOptions | None) -> FitOptions:
 
 
 def check_usable(options: FitOptions, recording: Recording) -> None:
-    """ValueError for options that a recording cannot serve, RuntimeError for one in float32."""
+    """ValueError for options that do not apply to a recording, RuntimeError for float32 data."""
     if recording.times.dtype != np.float64:
         raise RuntimeError(
             "fits need float64, for they compare motions that are nearly equal:"

@@ -22,7 +22,7 @@ from polhode._checks import (
 )
 from polhode.rotation import conjugate, multiply, normalise, wxyz_to_rotation_vector
 
-# angles per sample above which a record under-samples its own rotation
+# rotation angle between samples [rad] above which a recording under-samples the motion
 _TURN_PER_SAMPLE = np.pi
 
 
@@ -32,10 +32,10 @@ class Recording(eqx.Module):
     **Fields:** ``times`` (..., T), s, strictly increasing; any of ``omega`` (..., T, 3), rad/s, the
     gyroscope; ``wxyz`` (..., T, 4), attitudes body -> space; ``force`` (..., T, 3), m/s^2, the
     accelerometer (specific force); each with its standard deviation ``omega_noise``,
-    ``attitude_noise`` (rad), ``force_noise``, broadcast against it (1 where unknown: then the
-    scatter is taken from the residuals); ``present`` (..., T): 1 for a sample, 0 for a gap;
-    ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one, its gaps
-    bridged linearly; ``wheel_known`` (..., T): 1 where it was measured; ``saturated`` (..., T, 3):
+    ``attitude_noise`` (rad), ``force_noise``, broadcast against it (1 where unknown: a fit then
+    estimates its level from the residuals); ``present`` (..., T): 1 for a sample, 0 for a gap;
+    ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one, interpolated
+    in gaps; ``wheel_known`` (..., T): 1 where it was measured; ``saturated`` (..., T, 3):
     1 and -1 where an axis of the gyroscope is at its upper or lower limit, else 0; None: fits
     search for limits by themselves.
     """
@@ -65,24 +65,24 @@ class Recording(eqx.Module):
         attitude_noise: ArrayLike = 1.0,
         force_noise: ArrayLike = 1.0,
     ) -> Self:
-        """A checked recording. A sample whose row holds NaN is a gap and is left out.
+        """A validated recording. A sample with NaN in its row is a gap and is left out.
 
-        A sample with a NaN of ``wheel_speed`` alone is used, with the speed interpolated. Noises
+        If only its ``wheel_speed`` is NaN, the sample is used with an interpolated speed. Noises
         are numbers, or arrays of one for each axis (3,), sample (T,), or both (T, 3).
 
         Times must increase; they are shared or carry the same leading axes as the data. All arrays
         become float64, which fits need, if JAX has it (``jax_enable_x64``), else float32. Raises
         ValueError for unsorted or repeated times, fewer than four samples, shapes that do not fit,
         infinite values, noise that is not positive, and rates that turn the body by more than
-        half a turn between samples (degrees taken for radians?).
+        half a turn between samples (often degrees in place of radians).
         """
-        given, times = times, as_float_array("times", times, (None,))
-        times = times.astype(jnp.result_type(float))  # also of a log that was stored in float32
+        input_times, times = times, as_float_array("times", times, (None,))
+        times = times.astype(jnp.result_type(float))  # of float32 logs too
         require(
             times.shape[-1] >= 4, f"a recording needs at least 4 samples, got {times.shape[-1]}."
         )
         if is_concrete(times):
-            require_digits("times", np.asarray(given, float), np.asarray(times))
+            require_digits("times", np.asarray(input_times, float), np.asarray(times))
             step = np.diff(np.asarray(times), axis=-1)
             place = int(np.argmin(step.reshape(-1, step.shape[-1]).min(axis=0)))
             require(
@@ -116,7 +116,7 @@ class Recording(eqx.Module):
                 f"the leading axes of a recording must agree, got {batches}."
             ) from None
         require(0 not in batch, f"a recording needs at least one body, got the axes {batch}.")
-        # what is known now is worked on by NumPy, which has a hundredth of JAX's overhead
+        # NumPy for concrete arrays: its overhead per operation is a hundredth of JAX's
         xp = numbers(times, *arrays.values())
         arrays = {name: xp.broadcast_to(a, (*batch, *tails[name])) for name, a in arrays.items()}
         times = xp.broadcast_to(times, (*batch, count))
@@ -164,20 +164,20 @@ class Recording(eqx.Module):
 def rotation_vector_between(
     first: Float[Array, "*t 4"], second: Float[Array, "*t 4"]
 ) -> Float[Array, "*t 3"]:
-    """Rotation vectors, body axes, from attitudes to near ones: twice the quaternion's vector."""
+    """Rotation vectors (body axes) between nearby attitudes: twice the quaternion's vector part."""
     turn = multiply(conjugate(first), second)
     sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
     return 2 * sign * turn[..., 1:]
 
 
 def turns_between_samples(recording: "Recording") -> Float[Array, "*b t-1 3"]:
-    """Rotation vectors, body axes, from each attitude to the next, of up to half a turn."""
+    """Rotation vectors (body axes) from each attitude to the next, of up to half a turn."""
     wxyz = require_channel("wxyz", recording.wxyz)
     return wxyz_to_rotation_vector(multiply(conjugate(wxyz[..., :-1, :]), wxyz[..., 1:, :]))
 
 
 def turns_of_rates(recording: "Recording") -> Float[Array, "*b t-1 3"]:
-    """Rotation vectors, body axes, between samples by the mean of the rates at both."""
+    """Rotation vectors (body axes) between samples, from the mean of the rates at both."""
     omega = require_channel("omega_body", recording.omega)
     step = jnp.diff(recording.times, axis=-1)[..., None]
     return step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
@@ -191,7 +191,7 @@ def require_channel(name: str, array: Array | None) -> Array:
 
 
 def size_of_data(recording: Recording, channels: int) -> Array:
-    """How many numbers were measured; a saturated reading is not one."""
+    """Number of measured values, not counting saturated readings."""
     count = jnp.sum(recording.present) * channels
     if recording.saturated is None:
         return count
@@ -204,8 +204,8 @@ def interpolate_gaps(
 ) -> Array:
     """Values with those that are not ``present`` interpolated linearly between their neighbours.
 
-    ``values`` (..., t), or (..., t, c) for channels with the same gaps. Before the first known one
-    and after the last they are held.
+    ``values`` (..., t), or (..., t, c) for channels with the same gaps. Before the first present
+    value and after the last they are constant.
     """
     count = times.shape[-1]
 
@@ -215,7 +215,7 @@ def interpolate_gaps(
         previous_place = jnp.where(is_present, place, jnp.maximum(place - 1, 0))
         next_place = jnp.where(is_present, place, jnp.minimum(place + 1, count - 1))
 
-        # each round doubles the distance looked across
+        # pointer jumping: each round doubles the distance searched
         def farther(_, neighbours):
             previous_place, next_place = neighbours
             return previous_place[previous_place], next_place[next_place]
@@ -241,7 +241,7 @@ def interpolate_gaps(
 
 
 def stack(recordings: Sequence[Recording]) -> Recording:
-    """One recording with a leading axis from several; shorter ones are filled up with gaps.
+    """One recording with a leading axis from several; shorter ones are padded with gaps.
 
     Raises ValueError for recordings that have batch axes or different kinds of data.
     """
@@ -279,8 +279,8 @@ def stack(recordings: Sequence[Recording]) -> Recording:
 def averaged(recording: Recording, count: int) -> Recording:
     """Recording of means over blocks of ``count`` samples; a block with a gap is a gap.
 
-    For readings that are much faster than the motion. Raises ValueError for fewer than four
-    blocks, and for recordings with attitudes.
+    For sampling much faster than the motion. Raises ValueError for fewer than four blocks, and for
+    recordings with attitudes.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise ValueError(f"count must be an integer, at least 1, got {count!r}.")
@@ -309,7 +309,7 @@ def averaged(recording: Recording, count: int) -> Recording:
 
 
 def _with_gaps(name, value, suffix, dtype):
-    """Like ``as_float_array``, but NaN is allowed: it marks a gap."""
+    """Like ``as_float_array``, but with NaN allowed, which marks a gap."""
     raw = np.asarray(value) if is_concrete(value) else value
     holes = np.isnan(raw) if is_concrete(raw) and raw.dtype.kind == "f" else None
     clean = raw if holes is None else np.where(holes, np.zeros((), raw.dtype), raw)
@@ -318,16 +318,18 @@ def _with_gaps(name, value, suffix, dtype):
 
 
 def _blank(name, array):
+    """Values in place of NaN at gaps: identity quaternions, or zero."""
     if name == "wxyz":
         return np.broadcast_to(np.asarray([1, 0, 0, 0], array.dtype), array.shape)
     return np.zeros((), array.dtype)
 
 
 def _check_rates(omega, times):
+    """ValueError for rates that turn the body by more than half a turn between samples."""
     turn = np.linalg.norm(np.asarray(omega), axis=-1)[..., 1:] * np.diff(np.asarray(times), axis=-1)
     flat = turn.reshape(-1, turn.shape[-1])
     worst = flat.max(axis=0)
-    # a gap in an otherwise dense recording
+    # few intervals: a gap in an otherwise dense recording, or an outlier
     if 0 < np.sum(worst > _TURN_PER_SAMPLE) <= 0.1 * worst.size:
         place = int(np.argmax(worst))
         intervals = np.abs(np.diff(np.asarray(times), axis=-1)).reshape(-1, worst.size)
@@ -351,7 +353,7 @@ def _check_rates(omega, times):
 def _noise(name, value, shape, dtype):
     array = as_float_array(name, value).astype(dtype)
     require_positive(name, array, hint="it is a standard deviation")
-    # as it is, or one number of each sample for three axes
+    # broadcast as it is, or as one number for the three axes of each sample
     for fitting in (array, array[..., None]) if shape[-1] == 3 else (array,):
         with contextlib.suppress(ValueError):
             return numbers(array).broadcast_to(fitting, shape)
@@ -362,7 +364,7 @@ def _noise(name, value, shape, dtype):
 
 
 def central_slope(omega, times):
-    """Central differences."""
+    """Derivatives of ``omega`` (t, 3) by central differences, one-sided at the ends."""
     step = jnp.diff(times)[:, None]
     between = jnp.diff(omega, axis=0) / step
     inner_slopes = (between[1:] * step[:-1] + between[:-1] * step[1:]) / (step[1:] + step[:-1])

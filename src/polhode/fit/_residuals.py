@@ -36,12 +36,12 @@ from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxy
 
 # Residuals: data minus model in units of the noise.
 
-# Standard deviation of a gain that counts as exactly known.
+# Standard deviation of the prior for an entry of the gain that is exactly known.
 _EXACT = 1e-9
 
 
 class Model(eqx.Module):
-    """The model of a fit: how ``Parameters`` and a ``Recording`` give residuals.
+    """The model of a fit: it maps ``Parameters`` and a ``Recording`` to residuals.
 
     **Fields:** ``motion``; ``base``, ``columns`` (static): origin and directions of
     ``Parameters.shape``; ``attitude`` (r, 4): first recorded attitudes, to which
@@ -60,7 +60,7 @@ class Model(eqx.Module):
 
     @property
     def entries(self) -> int:
-        """How many entries of the tensor are unknown (static): 6, 3 without products, or none."""
+        """Number of unknown entries of the tensor (static): 6, 3 (no products) or 0."""
         if not any(self.columns):
             return 0
         return 6 if any(any(row) for row in self.columns[3:]) else 3
@@ -99,8 +99,8 @@ def residuals(
     """Residuals of rates, attitudes (rotation vectors) and accelerometer, over their noise.
 
     ``recording`` carries one leading axis r: recordings of one body, with the readings as recorded.
-    Gaps count zero, and so does a saturated reading while the model is beyond the limit. Any
-    optimiser can minimise the sum of squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
+    They are zero at gaps, and at a saturated reading while the model is beyond the limit. Any
+    optimiser can minimise the sum of squares; ``jax.grad`` and ``jax.jacfwd`` differentiate it.
     """
     recording = calibrate(recording, model.gyroscope)
     return residuals_of_motion(
@@ -111,7 +111,7 @@ def residuals(
 def residuals_of_motion(
     motion: Predicted, parameters: Parameters, recording: Recording, model: Model
 ) -> dict[str, Float[Array, "r t 3"]]:
-    """``residuals`` of a predicted motion, with the sensors simulated."""
+    """``residuals`` for a predicted motion; ``recording`` is calibrated (``calibrate``)."""
     weight = recording.present[..., None]
     parts = {}
     if recording.omega is not None:
@@ -120,7 +120,7 @@ def residuals_of_motion(
             weight * (recording.omega - _readings(motion, parameters, recording, model)) / noise
         )
         if recording.saturated is not None:
-            # A reading at the upper limit says only that the rate is not smaller.
+            # A reading at the upper limit is only a lower bound of the rate, and conversely.
             side = recording.saturated
             residual = jnp.where(side > 0, jnp.maximum(residual, 0), residual)
             residual = jnp.where(side < 0, jnp.minimum(residual, 0), residual)
@@ -152,7 +152,7 @@ def _readings(
     """Noise-free readings of the gyroscope, in the units of ``Recording.omega``."""
     omega = motion.omega
     if model.gyroscope.delay or parameters.delay is not None:
-        # Two terms of Taylor's series: delays are short beside the time in which rates change.
+        # Taylor series to second order: delays are short compared with the time scale of the rates.
         delay = model.gyroscope.delay
         delay = delay if parameters.delay is None else delay + parameters.delay
         slope = motion.omega_dot
@@ -175,8 +175,7 @@ def _readings(
 
 
 def _in_rates(readings: Float[Array, "*b 3"], gain: Array | None) -> Float[Array, "*b 3"]:
-    """Readings as rates of a calibrated gain, which a solver of linear equations would take out of
-    the kernel."""
+    """``gain^-1 readings``, by the adjugate: a linear solver could not run in the fused kernel."""
     if gain is None:
         return readings
     columns = jnp.unstack(gain.astype(readings.dtype), axis=1)
@@ -194,7 +193,7 @@ def walk_of(steps: Float[Array, "k 3"], times: Float[Array, " t"]) -> Float[Arra
 
 
 class Prior(NamedTuple):
-    """Precisions of the unknowns of the sensors' calibration, by name as in ``Parameters``."""
+    """Precisions (inverse variances) of the priors, by name as in ``Parameters``."""
 
     gain: Float[Array, " 9"] | None
     bias: Float[Array, " 3"] | None
@@ -204,13 +203,13 @@ class Prior(NamedTuple):
 
 
 def prior_of(parameters: Parameters, recording: Recording, model: Model) -> Prior:
-    """Inverse variances of the calibration; None where an unknown is absent or has no prior."""
+    """The ``Prior`` of the unknowns; None where an unknown is absent or has no prior."""
     sensor, dtype = model.gyroscope, recording.times.dtype
 
     def precision(std, like):
         return None if like is None else jnp.broadcast_to(jnp.asarray(std, dtype) ** -2, like.shape)
 
-    # an entry that is exactly known is an unknown that cannot move
+    # an exactly known entry remains an unknown, which a narrow prior fixes
     widths = np.maximum(sensor.gain_std.ravel(), _EXACT)
     walk = None
     if parameters.walk is not None:
@@ -232,7 +231,7 @@ def prior_of(parameters: Parameters, recording: Recording, model: Model) -> Prio
 
 
 def prior_residuals(parameters: Parameters, recording: Recording, model: Model) -> list[Array]:
-    """Unknowns that have a prior, less its mean, over its standard deviation."""
+    """Differences of the unknowns from their prior means, over the standard deviations."""
     prior = prior_of(parameters, recording, model)
     parts = [
         (precision, getattr(parameters, name))
@@ -264,11 +263,11 @@ def log_density(
     """Logarithm of the posterior density of ``Parameters``, up to a constant, for any sampler.
 
     ``recording`` as in ``residuals`` (one leading axis: ``stack([recording])``), ``model`` that of
-    a fit, whose ``parameters`` are the place to start from; ``prior`` adds the logarithm of its
-    density (None: flat in the parameters, that is in the second moments away from flat bodies),
-    beside that of the gyroscope's calibration, which is always included. ``noise``: standard
-    deviation of the residuals over the noise of the recording; ``Fit.noise`` where that is not
-    known.
+    a fit, whose ``parameters`` are a suitable start for the sampler. ``prior`` adds the logarithm
+    of a density (None: flat in the parameters, that is in the second moments away from flat
+    bodies); the priors of the fit (calibration, ``prior_std``) are always included. ``noise``:
+    standard deviation of the residuals over the noise of the recording; where the noise is not
+    known, ``Fit.noise``.
     The result is a density for BlackJAX; its negative is a ``potential_fn`` for NumPyro.
     """
 
@@ -291,12 +290,12 @@ def log_density(
 
 
 class Linear(NamedTuple):
-    """Residuals (c channels side by side) and what their derivatives amount to.
+    """Residuals (c channels side by side), linearised at one point.
 
-    ``shared``, ``own``, ``factored_residuals``: the triangular factor of a recording's derivatives
-    by shared and own unknowns and of its residuals, column block by column block. Sums of squares
-    and products are those of all samples, so that an optimiser works on a handful of rows. ``at``:
-    the shared unknowns of the place.
+    ``shared``, ``own``, ``factored_residuals``: column blocks of the triangular factor R of a
+    recording's matrix ``[derivatives by shared unknowns, by own unknowns, residuals] = Q R``. Its
+    sums of squares and products are those of all samples, so that an optimiser works on a few rows.
+    ``at``: the shared unknowns at that point.
     """
 
     residuals: Float[Array, "r t c"]
@@ -330,12 +329,13 @@ class Linear(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """The unknowns of a fit as numbers, and the way back.
+    """The unknowns of a fit as flat arrays, and the inverse map.
 
     ``shared`` (s,): the tensor's entries, bias, mounting, lever, the motion's own, gain and delay;
     ``own`` (r, o): rates, attitude and the walk of the bias of each recording. ``of_motion``,
     ``of_own`` (static): which of them the motion depends on; all others belong to the sensors.
-    ``parameters``: those of one recording, and the tensor, of its numbers.
+    ``parameters``: function of ``shared`` and one row of ``own`` that returns the ``Parameters`` of
+    that recording and the tensor.
     """
 
     shared: Float[Array, " s"]
@@ -346,7 +346,8 @@ class Unknowns(NamedTuple):
 
 
 def unknowns(parameters: Parameters, model: Model) -> Unknowns:
-    """See ``Unknowns``. The tensor's entries are regular unknowns for flat bodies too."""
+    """``Unknowns`` of these parameters. Entries of the tensor take the place of ``shape``, because
+    they are regular coordinates for flat bodies too."""
     count = model.entries
     entries = entries_of(model.tensor(parameters), count)
     sensors = (parameters.bias, parameters.mounting, parameters.lever)
@@ -381,7 +382,7 @@ def unknowns(parameters: Parameters, model: Model) -> Unknowns:
 
 
 def with_entries(x: Array, places: np.ndarray, values: Array) -> Array:
-    """``x`` (n,) with ``values`` at ``places``, by a gather: a kernel holds no scatter."""
+    """``x`` (n,) with ``values`` at ``places``, by a gather: a scatter would leave the kernel."""
     order = np.arange(x.shape[0])
     order[places] = x.shape[0] + np.arange(places.size)
     return jnp.concatenate([x, values])[order]
@@ -393,8 +394,8 @@ def linearise(
     """Residuals and Jacobian of all recordings: the motion appears once in the program.
 
     ``layout`` gives the order of ``shared`` and ``own``. The motion, which is the expensive part,
-    is differentiated by the unknowns that it depends on; those of the sensors act on the motion
-    that was predicted, which costs next to nothing for each of them.
+    is differentiated by the unknowns that it depends on only. The sensors' unknowns act on the
+    predicted motion, so that their derivatives cost almost nothing.
     """
     motion_places, own_motion_places = (
         np.flatnonzero(layout.of_motion),

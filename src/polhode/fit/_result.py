@@ -31,12 +31,12 @@ from polhode.fit._model import LeafMotion, Parameters, entries_of, whole_of
 from polhode.fit._residuals import Model
 from polhode.inertia import Inertia
 
-# Part of an unknown in directions that the data do not show, above which it is not known.
+# Component of an unknown along null directions above which it counts as undetermined.
 MAX_NULL_PART = 1e-3
 
 
 class InertiaEstimate(eqx.Module):
-    """The inertia that a fit estimated; ``Fit`` documents the fields and passes them on."""
+    """The inertia that a fit estimated; the properties of ``Fit`` document these fields."""
 
     inertia: Inertia
     moments: Float[Array, "*b 3"]
@@ -55,14 +55,14 @@ class Fit(eqx.Module):
     **Fields** of every fit, r recordings of a body and p unknowns:
 
     - ``values``: list of the fitted arrays, and ``std`` their standard deviations (infinite for
-      what the data do not show). Of ``fit_scene`` these are the arrays that ``free`` listed; of an
-      inertia the tensor (..., 3, 3) [kg m^2] in sensor axes and the unknowns of the motion (leaves
-      of ``parameters.motion``: drag, delay).
-    - ``sensor``, ``sensor_std``: those fitted of ``"gain"`` (..., 3, 3), ``"bias"`` (..., 3)
+      what the data do not show). For ``fit_scene`` these are the arrays that ``free`` listed; for
+      an inertia the tensor (..., 3, 3) [kg m^2] in sensor axes and the unknowns of the motion
+      (leaves of ``parameters.motion``: drag, delay).
+    - ``sensor``, ``sensor_std``: the fitted ones of ``"gain"`` (..., 3, 3), ``"bias"`` (..., 3)
       [rad/s], ``"delay"`` (...) [s] and ``"mounting"`` (..., 3) [rad] of the gyroscope and
       ``"lever"`` (..., 3) [m] of the accelerometer.
     - ``initial``: ``ph.State`` (..., r) at the first time of each recording. Without recorded
-      attitudes the space axes are those of the body then, or the ``attitude`` of ``fit_scene``.
+      attitudes its attitude is the identity, or the ``attitude`` of ``fit_scene``.
     - ``covariance`` (..., p, p) of all unknowns: the tensor's entries xx, yy, zz, yz, zx, xy (three
       for ``MomentsOnly``, none of a scene), bias, mounting, lever, the motion's unknowns or the
       scene's values, gain (row by row) and delay, then of each recording rates and attitude
@@ -73,12 +73,12 @@ class Fit(eqx.Module):
     - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
     - ``whiteness`` (...): probability of autocorrelations as large as observed, for independent
       residuals (Ljung-Box).
-    - ``rms`` (...): of the residual rates [rad/s]; NaN without rates.
+    - ``rms`` (...): root mean square of the residual rates [rad/s]; NaN without rates.
     - ``diagnostics`` (...): ``Finding`` flags as integers; ``findings``, ``warnings``, ``report``
       and ``is_usable`` explain them.
-    - ``steps``, ``attempts`` (...): of the optimiser.
+    - ``steps``, ``attempts`` (...): numbers of optimiser steps and of starting points tried.
     - ``residuals``: of ``"omega"``, ``"attitude"``, ``"force"`` (..., r, T, 3) over their noise.
-    - ``parameters``, ``model``: of ``predict``, ``residuals`` and ``log_density``.
+    - ``parameters``, ``model``: arguments of ``predict``, ``residuals`` and ``log_density``.
 
     **Of an inertia** (``fit_inertia``, ``fit_recordings``): ``inertia``,
     ``moments``, ``axes``, ``ratios``, their standard deviations, ``scale_known``,
@@ -117,8 +117,8 @@ class Fit(eqx.Module):
     def inertia(self) -> Inertia:
         """Full tensor (...) in sensor axes about the centre of mass, reaction wheels locked.
 
-        Where ``scale_known`` is False the data show only its shape: the largest moment is 1 (any
-        number for a ``SceneMotion`` with unknowns of its own, whose values belong to it).
+        Where ``scale_known`` is False the data show only its shape: the largest moment is 1 (with a
+        ``SceneMotion`` that has unknowns it is arbitrary, and their values refer to it).
         """
         return self._of_inertia("inertia").inertia
 
@@ -179,7 +179,7 @@ class Fit(eqx.Module):
 
     @property
     def scene(self) -> Scene:
-        """The scene with the fitted numbers; leading axes (...) as the fit has them."""
+        """The scene with the fitted numbers and the leading axes (...) of the fit."""
         motion = self.model.motion
         if self._inertia is not None or not isinstance(motion, LeafMotion):
             raise AttributeError(
@@ -204,10 +204,10 @@ class Fit(eqx.Module):
         **Arguments:** ``function`` of the list ``values``, differentiable by JAX, with an array of
         any shape; ``body``: number in the flattened batch.
 
-        By linear propagation of ``covariance``. A function may be known although its arguments are
-        not: where the data do not show the common size of inertia and drag, their ratio has a
-        finite deviation, ``fit.derived(lambda v: v[1] / v[0])``. Infinite for what the data do not
-        show.
+        By linear propagation of ``covariance``. The data may determine a function but not its
+        arguments: where they do not show the common size of inertia and drag, the ratio of these
+        has a finite deviation, ``fit.derived(lambda v: v[1] / v[0])``. The deviation is infinite
+        for functions that the data do not determine.
         """
         lead = np.ndim(self.diagnostics)
         values = [jnp.reshape(x, (-1, *jnp.shape(x)[lead:]))[body] for x in self.values]
@@ -259,16 +259,16 @@ class Fit(eqx.Module):
                 path for path, _ in jax.tree_util.tree_flatten_with_path(self.parameters.motion)[0]
             ]
         texts = (jax.tree_util.keystr(path, simple=True, separator=".") for path in paths)
-        names = [text or "unknown" for text in texts]  # of a motion whose unknown is one array
+        names = [text or "unknown" for text in texts]  # empty if the unknown is a single array
         if self._inertia is None:
             return names
         return ["inertia", *("motion.inertia" if x == "inertia" else x for x in names)]
 
     def common_scale(self, body: int = 0) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """What is known of ``values`` where the data show all of them but for a common factor.
+        """Ratios of ``values`` where the data determine some of them only up to a common factor.
 
-        Names, ratios to the largest of all and standard deviations of the ratios, of those values
-        that the factor multiplies; empty where the data show the values themselves, or less.
+        Of these values: names, ratios to the largest and standard deviations of the ratios. Empty
+        where the data determine the values themselves, or not even their ratios.
         """
         lead = np.ndim(self.diagnostics)
         values = [np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body] for x in self.values]
@@ -282,7 +282,7 @@ class Fit(eqx.Module):
         for j in unknown:
             ratio, std = self.derived(lambda v, j=j: v[j] / v[k][place], body)
             if j == k:
-                std[place] = 0  # of the largest to itself, rounding aside
+                std[place] = 0  # the ratio of the largest value to itself is exactly 1
             if not np.all(np.isfinite(std)):
                 return []
             rows.append((self.value_names[j], ratio, std))
@@ -320,12 +320,12 @@ class Fit(eqx.Module):
         return "the noise of the readings: more samples, or faster rotation, help"
 
     def _count(self, *names: str) -> int:
-        """How many unknowns of one body belong to these fields of ``parameters``."""
+        """Number of unknowns of one body in these fields of ``parameters``."""
         leaves = [x for name in names for x in jax.tree.leaves(getattr(self.parameters, name))]
         return sum(int(np.prod(np.shape(x)[np.ndim(self.diagnostics) :])) for x in leaves)
 
     def _calibration_part(self, body: int) -> float:
-        """Part of the variance of the values that an exact calibration would remove, at most."""
+        """The largest part of the variance of a value that an exact calibration would remove."""
         entry_count = self.model.entries
         if self.parameters.gain is None:
             return 0.0
@@ -346,12 +346,12 @@ class Fit(eqx.Module):
         return float(np.max(np.diagonal(removed) / np.where(total > 0, total, np.inf)))
 
     def to_dict(self, body: int = 0) -> dict[str, Any]:
-        """The result of one body as numbers, lists and texts, such as JSON holds.
+        """The result of one body as numbers, lists and strings, ready for JSON.
 
         ``values`` and ``std`` by their names (``value_names``), the sensor, the initial states, the
         covariance, and what ``report`` shows; of an inertia its principal moments and axes as well.
-        Units are SI. None stands for what is not finite: a standard deviation of what the data do
-        not show.
+        Units are SI. None stands for a number that is not finite, such as the standard deviation of
+        an undetermined value.
         """
         lead = np.ndim(self.diagnostics)
 
@@ -466,16 +466,16 @@ class Fit(eqx.Module):
         """What the recordings of one body can show, and what would show the rest."""
         rows = []
         gained = self._calibration_shown(body)
-        rests = "data" if gained is None else "data and calibration"
+        data_source = "data" if gained is None else "data and calibration"
         if self._inertia is not None:
             spread = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
             shown_count = int(np.isfinite(spread).sum())
-            source = rests if shown_count else "nothing"
+            source = data_source if shown_count else "nothing"
             remedy = "" if shown_count == 2 else "another spin, away from the principal axes"
             rows.append(Observability("ratios of the moments (2)", 2, shown_count, source, remedy))
             size = int(self.scale_known)
             remedy = "" if size else "a wheel of known spin inertia, a known torque or moment"
-            source = rests if size else "nothing"
+            source = data_source if size else "nothing"
             rows.append(Observability("size of the inertia", 1, size, source, remedy))
             if not (self.scale_known or self._inertia.handedness_known):
                 remedy = "attitudes (wxyz), a wheel, or knowledge of the body"
@@ -488,7 +488,7 @@ class Fit(eqx.Module):
                 if has_prior:
                     shown_count = self._count_shown_beside_prior(k, body)
                 remedy = "" if shown_count == flat.size else "another motion, or fewer free numbers"
-                sources = [rests] * (shown_count > 0) + ["prior"] * has_prior
+                sources = [data_source] * (shown_count > 0) + ["prior"] * has_prior
                 source = " and ".join(sources) or "nothing"
                 name = f"{self.value_names[k]} ({flat.size})"
                 rows.append(Observability(name, flat.size, shown_count, source, remedy))
@@ -502,7 +502,7 @@ class Fit(eqx.Module):
 
     @property
     def _prior_std(self) -> list[Array | None]:
-        """Of each of ``values`` of a scene the standard deviation of its prior."""
+        """Standard deviations of the priors of a scene's ``values``; None without a prior."""
         return self.model.motion.prior_std()
 
     def _count_shown_beside_prior(self, k: int, body: int) -> int:
@@ -593,6 +593,6 @@ def checked_fit(fit: Fit, throw: bool) -> Fit:
 
 
 def mirror_moments(moments: Any) -> Any:
-    """Moments (..., 3) of ``Fit.mirror_inertia``, in the order of those given."""
+    """Moments (..., 3) of ``Fit.mirror_inertia``, in the order of ``moments``."""
     other = moments * (moments.sum(axis=-1, keepdims=True) - 2 * moments)
     return other / other.max(axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""From recordings of one body to its best parameters: start, optimisation, information."""
+"""The fit of one body: starting points, optimisation, and linearisation at the optimum."""
 
 import dataclasses
 
@@ -42,34 +42,35 @@ from polhode.fit._start import (
 )
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 
-# Parts of the recording that are fitted one after the other where the whole misleads at first.
+# Growing parts of the recording, fitted in turn where a fit of the whole ends in a local minimum.
 _PARTS = (0.1, 0.2, 0.35, 0.6, 1.0)
-# Spread of the shape about its start that is believed while a part alone hardly shows it.
+# Standard deviation of a prior of ``shape`` while a part of the data alone hardly determines it.
 _SPREAD = 0.1
-# Residuals up to this multiple of the noise, or of what neighbouring samples show of it, end the
-# search for a better valley.
+# Residuals up to this multiple of the noise (known, or estimated from neighbouring samples) end the
+# search for a better minimum.
 _GOOD = 1.5
-# Residuals, in standard deviations, beyond which no start is taken for the best that there is.
+# Residuals beyond this multiple of the noise do not end it, even if two starts reach one optimum.
 _BAD = 5.0
-# Relative difference of two costs that are those of one optimum.
+# Two costs with a smaller relative difference belong to one optimum.
 _SAME = 1e-4
-# Difference of two costs, in units of the variance of the noise, that is no reason to take a fit
-# that did not converge.
+# A fit that did not converge replaces a converged one only if its cost is lower by more than this,
+# in units of the variance of the noise.
 _ALIKE = 2.0
-# Part of the readings that always counts as noise beside the calibration's prior: without it
-# noise-free readings would leave the calibration free.
+# Least noise, as a part of the readings, in the weight of the calibration's prior: with noise-free
+# readings the prior would otherwise have no weight and the calibration would be undetermined.
 _LEAST_NOISE = 1e-6
 # Distance from the optimum, in standard deviations, at which the optimiser stops.
 _OFFSET = 1e-4
 
 
 class Solution(eqx.Module):
-    """The optimum and everything that is linear about it.
+    """The optimum and the residuals linearised there.
 
-    ``tensor``: of any size where the data show none. ``linear``: residuals and Jacobian by the
-    entries of the tensor (xx, yy, zz, and for a full one yz, zx, xy) and the other unknowns.
-    ``cost``: half the sum of squares. ``steps``: of all attempts together. ``attempts``: how many
-    starts were tried. ``expected``: the sum of squares that noise alone would leave.
+    ``tensor``: of arbitrary size where the data do not determine it. ``linear``: residuals and
+    Jacobian by the entries of the tensor (xx, yy, zz, and for a full one yz, zx, xy) and the other
+    unknowns. ``cost``: half the sum of squares. ``steps``: of all attempts together. ``attempts``:
+    number of starting points tried. ``stopped``: whether the optimiser converged. ``expected``: the
+    sum of squares that noise alone would leave.
     """
 
     parameters: Parameters
@@ -84,7 +85,8 @@ class Solution(eqx.Module):
 
 
 class _Search(eqx.Module):
-    """Where the search stands: the job at hand, where it left off, and the best so far."""
+    """Carry of the search loop: the next row of ``_sequence_of_fits`` (``job``), the parameters
+    that the last fit reached, and the best solution so far; ``good``: whether the search ends."""
 
     job: Array
     scaled_parameters: Parameters
@@ -143,7 +145,7 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     solver = options.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
     expected = _expected_square_sum(recording, options)
     count = _data_count(recording)
-    # of one residual: 1 where the noise is known
+    # standard deviation of one residual: 1 where the noise is known
     noise = jnp.sqrt(expected / count)
     noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
 
@@ -156,11 +158,10 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         return linearise(shared, own, layout, data_part, model_of(base))
 
     def prior_unit(linear):
-        """Noise of the residuals, the unit in which the calibration's prior is weighed.
+        """Standard deviation of the residuals, the factor of the prior's residuals.
 
-        With a known noise it is one. Else it is that of the present residuals: the sum of squares
-        is then proportional, to first order in 1/T, to the logarithm of the likelihood of an
-        unknown noise.
+        With a known noise it is one, else that of the present residuals: the sum of squares is then
+        proportional, to first order in 1/T, to the log-likelihood with an unknown noise.
         """
         unit = jnp.ones((), dtype) if trusted else jnp.sqrt(jnp.sum(linear.residuals**2) / count)
         typical = 10 / weight / jnp.sqrt(count / rates.shape[0])
@@ -224,12 +225,12 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             parameters_of(solution.value), recording, model_of(base)
         )
         uses_all_data = part[job] == 1
-        # of two that the data hardly tell apart the one that converged
+        # of two fits with nearly equal costs, prefer the one that converged
         converged = solution.result == optx.RESULTS.successful
         ahead = converged.astype(dtype) - search.stopped.astype(dtype)
         better = uses_all_data & (cost < search.cost + ahead * _ALIKE * prior_unit(linear) ** 2)
         # Two starts that reach the same optimum near the noise end the search: a third rarely finds
-        # a better one. Far above the noise both may have met the same local minimum.
+        # a better one. Far above the noise both may have reached the same local minimum.
         same_optimum = uses_all_data & (jnp.abs(cost - search.cost) < _SAME * cost)
         candidate = (solution.value, base, linear, cost, converged)
         previous = (search.best, search.base, search.linear, search.cost, search.stopped)
@@ -248,14 +249,14 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             search.steps + solution.stats["num_steps"],
             search.attempts + jnp.where(uses_all_data, 1, 0),
             stopped,
-            # the limit of what is physical has local minima of its own
+            # a flat body, at the limit of what is physical, is often a local minimum: search on
             stopped & (misfit <= limit) & ~_is_flat(linear, model_of(base)),
         )
 
     first_base = jax.tree.map(lambda leaf: leaf[0], bases)
     _, struct = jax.eval_shape(misfits, first_scaled, (first_base, recording, noise))
     empty_linear = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
-    # the starting body, in case no attempt finishes
+    # the starting body, for the case that no attempt has a finite cost
     body = entries_of(inertia_of_second_moments(initial_moments), model_of(first_base).entries)
     empty_linear = empty_linear._replace(at=empty_linear.at.at[: body.shape[0]].set(body))
     first_search = _Search(
@@ -289,16 +290,16 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
 def _bias_of_rates(
     recording: Recording, options: FitOptions, gyroscope: Gyroscope
 ) -> Float[Array, " 3"] | None:
-    """The bias to start from, in rates: the mean turn beside attitudes, else zero; None where it is
-    not fitted."""
+    """The bias to start from, in calibrated rates: the mean difference from the rates of attitudes,
+    or zero without attitudes; None where it is not fitted."""
     if recording.omega is None or not (options.bias or gyroscope.bias_std):
         return None
     if recording.wxyz is None or options.mounting:
         return jnp.zeros(3, recording.omega.dtype)
-    known = recording.present[:, 1:] * recording.present[:, :-1]
+    both_present = recording.present[:, 1:] * recording.present[:, :-1]
     turns = turns_of_rates(recording) - turns_between_samples(recording)
-    total = jnp.sum(known * jnp.diff(recording.times, axis=-1))
-    return jnp.sum(known[..., None] * turns, axis=(0, 1)) / jnp.where(total > 0, total, 1)
+    total = jnp.sum(both_present * jnp.diff(recording.times, axis=-1))
+    return jnp.sum(both_present[..., None] * turns, axis=(0, 1)) / jnp.where(total > 0, total, 1)
 
 
 def _is_flat(linear: Linear, model: Model) -> Array:
@@ -312,8 +313,8 @@ def _is_flat(linear: Linear, model: Model) -> Array:
 def _sensor_start(
     recording: Recording, gyroscope: Gyroscope, bias: Array | None, dtype: jnp.dtype
 ) -> dict[str, Array | None]:
-    """The unknowns of the gyroscope, at their calibrated values but for the ``bias`` of its rates;
-    none without its readings."""
+    """Starting values of the gyroscope's unknowns: the calibrated ones (zero), and ``bias``, which
+    is converted from rates to readings; none without a gyroscope."""
     if recording.omega is None:
         return {}
     walk = (recording.times.shape[0], WALK_KNOTS, 3)
@@ -328,13 +329,16 @@ def _sensor_start(
 
 
 def _data_count(recording: Recording) -> Float[Array, ""]:
-    """How many numbers were measured."""
+    """Number of measured values."""
     channels = (recording.omega, recording.wxyz, recording.force)
     return size_of_data(recording, 3 * sum(channel is not None for channel in channels))
 
 
 def _sequence_of_fits(bases: int, attempts: int) -> dict[str, np.ndarray]:
-    """What is fitted in turn: the first two to all data, then each start to growing parts."""
+    """The fits in their order: two starts to all data, then each start to growing parts.
+
+    ``anew``: whether a fit begins at the starting values instead of the end of the previous one.
+    """
     tries = [[(base, 1.0, True)] for base in range(min(bases, 2))]
     for base in range(bases):
         tries.append([(base, part, part == _PARTS[0]) for part in _PARTS])
@@ -344,7 +348,7 @@ def _sequence_of_fits(bases: int, attempts: int) -> dict[str, np.ndarray]:
 
 
 def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
-    """The sum of squares that is to be compared with the noise: an outlier counts as its bound."""
+    """The sum of squares to compare with the noise; outliers count as ``robust.threshold``."""
     square = linear.residuals**2
     return jnp.sum(square if robust is None else jnp.minimum(square, robust.threshold**2))
 
@@ -352,8 +356,8 @@ def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
 def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Array, ""]:
     """The sum of squares that noise alone would leave.
 
-    An unknown noise is taken from neighbouring samples: of the rates, or without these of the
-    angles that the body has turned by along its axes.
+    An unknown noise is estimated from neighbouring samples: of the rates, or without rates, of the
+    accumulated rotation vectors (body axes).
     """
     expected = _data_count(recording)
     if noise_is_trusted(options):
@@ -379,9 +383,10 @@ def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Arr
 
 
 def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
-    """Brings the Jacobian to the order of ten, where the optimiser's first damping of one is mild.
+    """Factor of the residuals that gives data of norm ten, for which the optimiser's initial
+    damping of one is mild.
 
-    The damping is absolute, so that residuals in units of a small noise would switch it off.
+    The damping is absolute: it would have no effect on residuals in units of a small noise.
     """
     total = jnp.zeros((), rates.dtype)
     if recording.omega is not None:
@@ -398,7 +403,7 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
 
 
 def _beside(steps: Float[Array, "r t-1 c"]) -> Float[Array, "r t c"]:
-    """At each sample the sum of the numbers of the steps before and after it."""
+    """Sum, at each sample, of the values of the intervals before and after it."""
     before, after = (jnp.pad(steps, ((0, 0), side, (0, 0))) for side in ((1, 0), (0, 1)))
     return before + after
 
@@ -406,11 +411,11 @@ def _beside(steps: Float[Array, "r t-1 c"]) -> Float[Array, "r t c"]:
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
-        # at each sample the mean of the rates before and after it, as far as both ends are present
-        known = recording.present[:, 1:] * recording.present[:, :-1]
+        # at each sample the mean over the adjacent intervals whose two ends are present
+        both_present = recording.present[:, 1:] * recording.present[:, :-1]
         steps = jnp.diff(recording.times, axis=-1)
-        rates = known[..., None] * turns_between_samples(recording) / steps[..., None]
-        sums, counts = (_beside(x) for x in (rates, known[..., None]))
+        rates = both_present[..., None] * turns_between_samples(recording) / steps[..., None]
+        sums, counts = (_beside(x) for x in (rates, both_present[..., None]))
         values, has_rate = sums / jnp.maximum(counts, 1), (counts[..., 0] > 0).astype(rates.dtype)
         return interpolate_gaps(recording.times, has_rate, values)
     return interpolate_gaps(recording.times, recording.present, recording.omega)
@@ -423,7 +428,7 @@ def _bases(
     unknown: AbstractInertiaUnknown,
     initial: Inertia | None,
 ) -> tuple[Base, Array]:
-    """Starting bodies (leading axis), the best first, and the second moments of that one."""
+    """Starting bodies (leading axis), the most promising first, and its second moments."""
     if unknown.columns().shape[1] == 0:
         whole_moments = jnp.eye(3, dtype=rates.dtype)
         return jax.tree.map(lambda leaf: leaf[None], base_of(whole_moments, True)), whole_moments
@@ -447,7 +452,7 @@ def _bases(
 def _scale(
     begin: Parameters, recording: Recording, rates: Array, gyroscope: Gyroscope
 ) -> Parameters:
-    """Natural sizes of the unknowns, so that one damping suits them all."""
+    """Typical sizes of the unknowns: in these units one damping suits them all."""
     typical = jnp.sqrt(jnp.mean(rates**2)) + jnp.finfo(rates.dtype).tiny
     of_reading = typical
     if gyroscope.gain is not None:
@@ -475,7 +480,8 @@ def _scale(
 
 
 def _size(start: Array) -> Array:
-    """Sizes of unknowns: of their start, where that is zero of the largest beside it, or one."""
+    """Sizes of the unknowns of an array: of their starting values; for a zero that of the largest
+    one in the array, or one."""
     largest = jnp.max(jnp.abs(start), initial=0)
     beside = jnp.where(largest > 0, largest, 1)
     return jnp.where(start != 0, jnp.abs(start), beside)

@@ -20,10 +20,11 @@ from polhode.fit._recording import central_slope
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
 
-# second moments below this part of their sum are lifted to it before the logarithm is taken
+# least second moment of a starting body, as a part of their sum
 _FLATTEST = 3e-3
-# rounds of interpolation with the tensor of the round before
+# rounds of the regression; each interpolates the rates with the tensor of the round before
 _ROUNDS = 3
+# pieces of each recording in the second regression
 _PIECES = 6
 
 
@@ -59,10 +60,10 @@ def integrate(
 
 
 def _products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Float[Array, "n 4"]:
-    """Running products of quaternions: within rows of a square, all at a time, then over its rows.
+    """Cumulative products of quaternions: along all rows of a square array, then over its rows.
 
-    As short a way as any for the machine, and the shortest program: its derivatives compile in
-    half the time that ``associative_scan`` takes.
+    It runs as fast as ``associative_scan`` and is a smaller program: its derivatives compile in
+    half the time.
     """
     count = turns.shape[0]
     side = math.isqrt(count - 1) + 1
@@ -101,20 +102,20 @@ def regression(
     present: Float[Array, "r t"],
     momentum: Float[Array, "r t 3"] | None = None,
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"], Float[Array, ""]]:
-    """Second moments (3, 3) to start from, in two ways, and the relative misfit of the first.
+    """Starting second moments (3, 3) by two regressions, and the relative misfit of the first.
 
-    The first takes the momentum as constant over each recording, the second over pieces of it,
-    which forgives errors of the integrated attitude and a slow loss of momentum.
+    The first treats the momentum as constant over each recording, the second over pieces of it,
+    which tolerates errors of the integrated attitude and a slow loss of momentum.
 
-    ``momentum``: body components of a wheel's momentum; without it the tensor is scaled to unit
-    Frobenius norm, since only its shape shows. Without it, too, the rates between the samples are
-    interpolated with the derivatives that Euler's equations give for the tensor found before:
-    records of few samples per turn need that.
+    ``momentum``: body components of a wheel's momentum. Without it the tensor is scaled to unit
+    Frobenius norm, since the data determine only its shape, and the rates between the samples are
+    interpolated with the derivatives that Euler's equations give for the tensor of the previous
+    round: recordings with few samples per turn need that.
     """
 
     count = times.shape[1]
     all_samples = jnp.ones((1, count), omega.dtype)
-    # parts in which errors of the integrated attitude have no time to grow
+    # short pieces, in which the error of the integrated attitude remains small
     place = np.arange(count) * _PIECES // count
     pieces = jnp.asarray(place == np.arange(_PIECES)[:, None], omega.dtype)
 
@@ -172,7 +173,7 @@ def regression(
 def alternative_starts(
     omega: Float[Array, "r t 3"], initial_moments: Float[Array, "3 3"]
 ) -> list[Array]:
-    """Other second moments: long, flat and middling bodies along the directions of the rates."""
+    """Other second moments: elongated, flat and intermediate bodies, with axes of the rates."""
     spread = jnp.einsum("rti,rtj->ij", omega, omega)
     _, axes = eigh(spread)
     size = initial_moments[0, 0] + initial_moments[1, 1] + initial_moments[2, 2]
@@ -185,10 +186,10 @@ def alternative_starts(
 def neighbour_noise_variance(
     times: Float[Array, " t"], omega: Float[Array, "t 3"], present: Float[Array, " t"]
 ) -> Float[Array, ""]:
-    """Variance of the noise as neighbours show it: each sample against the cubic through four.
+    """Variance of the noise, from each sample's difference to the cubic through four neighbours.
 
-    An upper bound in the mean: where the sampling is coarse the motion itself adds to it. Infinite
-    where no five samples follow each other.
+    An upper bound on average: with coarse sampling the motion itself adds to it. Infinite if no
+    five successive samples are present.
     """
     offset = jnp.stack([times[k : times.shape[0] - 4 + k] for k in range(5)]) - times[None, 2:-2]
     value = jnp.stack([omega[k : times.shape[0] - 4 + k] for k in range(5)])

@@ -44,7 +44,7 @@ class AbstractTurning(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """Floating dtype of the numbers of the frame; that of JAX for functions of time alone."""
+        """Floating dtype of the frame's numbers; JAX's default for functions of time alone."""
         leaves = [x for x in jax.tree.leaves(self) if eqx.is_inexact_array(x)]
         return jnp.result_type(*leaves) if leaves else jnp.result_type(float)
 
@@ -75,18 +75,19 @@ class ConstantRate(AbstractTurning):
 def _turning(
     omega_body: Callable, t: Array, t0: Array, start: Array, wxyz: Array, *hoisted: Array
 ) -> Array:
-    """The attitude ``wxyz`` at ``t``, with the derivatives by ``t`` and by the time ``t0`` of the
-    attitude ``start`` that the angular velocity gives it."""
+    """The attitude ``wxyz`` at ``t``, with analytic derivatives by ``t`` and by the time ``t0`` of
+    the attitude ``start``, from the angular velocity."""
     return wxyz
 
 
 @_turning.defjvp
 def _turning_rule(omega_body, primals, tangents):
-    # Through the steps of an integration they would be zero at its start, where there is no step.
+    # Differentiated through the steps of the integration, they would be zero at t = t0, where there
+    # is no step.
     t, t0, start, _, *hoisted = primals
     value = _turning(omega_body, *primals)
     rate = wxyz_rate(value, omega_body(t, *hoisted))
-    # a later t0 leaves out the rotation that the start would have made until then
+    # a later t0 omits the rotation between the earlier and the later one
     start_rate = wxyz_rate(start, omega_body(t0, *hoisted))
     rate_by_t0 = -multiply(multiply(start_rate, conjugate(start)), value)
     return value, tangents[3] + rate * tangents[0] + rate_by_t0 * tangents[1]
@@ -103,7 +104,7 @@ class VariableRate(AbstractTurning):
         return rate_of_change(self.omega_body, t)
 
     def attitude(self, t):
-        """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
+        """One adaptive integration from ``t0``, with a tolerance of 50 rounding errors per step."""
         if t.weak_type:
             t = t.astype(self.t0.dtype)
         omega_body, hoisted = jax.closure_convert(self.omega_body, t)
@@ -113,7 +114,7 @@ class VariableRate(AbstractTurning):
         return _turning(omega_body, t, t0, self.start, integrated, *hoisted)
 
 
-@eqx.filter_jit  # once for every frame: diffrax would compile its loop at every eager call
+@eqx.filter_jit  # compiled once per frame: outside jit diffrax would compile its loop at every call
 def _integrated(turning: VariableRate, t: Array) -> Array:
     accuracy = 50 * float(jnp.finfo(turning.start.dtype).eps)
     solution = diffrax.diffeqsolve(
@@ -158,7 +159,8 @@ class PrescribedAttitude(AbstractTurning):
 
 @jax.jit
 def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
-    """Rotation vector of each interval and its two derivatives by t/h, at start and end."""
+    """Rotation vector of each interval, with its first two derivatives by s = (t - start)/h, at its
+    start and its end: two arrays (t-1, 3, 3)."""
     start, end = slice(None, -1), slice(1, None)
     origin = conjugate(wxyz[start])
     rate = wxyz_rate(wxyz, omega_body)
@@ -183,13 +185,13 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
     return jnp.stack(start_values, axis=1), jnp.stack(end_values, axis=1)
 
 
-@smooth  # the pieces meet with their second derivatives: no step has to end at a sample
+@smooth  # second derivatives are continuous at the samples, so no step has to end there
 def _interval(times: Array, t: Array) -> Array:
     """Index k of the interval from ``times[k]`` to ``times[k + 1]`` that contains ``t``; beyond the
     samples, the nearest one.
 
-    The last time is repeated after an event that ends a simulation: intervals of no width are left
-    out.
+    After an event that ends a simulation the last time is repeated; these intervals of zero width
+    are left out.
     """
     place = jnp.searchsorted(times, t, side="right") - 1
     widths = jnp.sum(times[1:] > times[:-1], dtype=place.dtype)
@@ -197,11 +199,11 @@ def _interval(times: Array, t: Array) -> Array:
 
 
 class SampledAttitude(eqx.Module):
-    """Attitude through samples, with their angular velocities and angular accelerations.
+    """Attitude interpolated through samples with angular velocities and angular accelerations.
 
     Between two samples the rotation vector from the earlier one is the polynomial of degree five
-    that matches attitude, rate and acceleration at both. For samples h apart the attitude is in
-    error by O(h^6), the angular velocity by O(h^5), the angular acceleration by O(h^4); at the
+    that matches attitude, rate and acceleration at both. For samples h apart the error of the
+    attitude is O(h^6), of the angular velocity O(h^5), of the angular acceleration O(h^4); at the
     samples all three are exact. Beyond the samples the nearest polynomial is extrapolated.
     """
 
@@ -213,7 +215,7 @@ class SampledAttitude(eqx.Module):
     def __init__(
         self, ts: ArrayLike, wxyz: ArrayLike, omega_body: ArrayLike, angular_acceleration: ArrayLike
     ):
-        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn from one to the next."""
+        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn between two of them."""
         self.ts = as_float_array("ts", ts, (None,))
         self.wxyz = as_float_array("wxyz", wxyz, (None, 4))
         rates = as_float_array("omega_body", omega_body, (None, 3))
@@ -227,7 +229,8 @@ class SampledAttitude(eqx.Module):
         k = _interval(times, ascending_time)
         s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
         (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
-        # Taylor at the start, and three terms that meet value, slope and bend at the end
+        # Taylor polynomial at the start, plus three terms that match value, first and second
+        # derivative at the end
         value, slope, bend = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
         cubic = 10 * value - 4 * slope + bend / 2
         quartic = -15 * value + 7 * slope - bend
@@ -241,14 +244,14 @@ Vector = Float[Array, "*#b 3"]
 
 
 def _at_times(function: Callable, t: Time, dtype: Any):
-    """The function of one time, at every entry of an array of times.
+    """A function of one time, evaluated at every entry of an array of times.
 
-    Lists and integers become floats of ``dtype``.
+    Lists and integers are converted to ``dtype``.
     """
     times = as_float_array("t", t, finite=False)
     if not (isinstance(t, float) or jnp.issubdtype(getattr(t, "dtype", int), jnp.floating)):
         times = times.astype(dtype)
-    if times.size == 0:  # an integration has no empty batches
+    if times.size == 0:  # an integration does not support empty batches
         like = jax.eval_shape(function, jax.ShapeDtypeStruct((), times.dtype))
         return jax.tree.map(lambda x: jnp.zeros((*times.shape, *x.shape), x.dtype), like)
     for _ in range(times.ndim):
@@ -261,7 +264,7 @@ def _cross(left: Array, right: ArrayLike) -> Array:
 
 
 def _aligned(*arrays: Array) -> list[Array]:
-    """Arrays with leading axes of length one, so that all have the same rank."""
+    """The arrays with leading axes of length one added, so that all have the same rank."""
     rank = max(array.ndim for array in arrays)
     return [array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays]
 
@@ -281,8 +284,8 @@ class RotatingFrame(eqx.Module):
 
     Built by `from_rate`, `from_attitude` or `from_trajectory`. Vectors have shape (..., 3), times
     are scalars or arrays that broadcast against the leading axes; "frame" components are along the
-    rotating axes, "space" components along inertial ones. A frame is one frame: for a batch of
-    frames use ``jax.vmap``. What a frame lacks is None and costs nothing: a constant angular
+    rotating axes, "space" components along inertial ones. An object is a single frame: for a batch
+    of frames use ``jax.vmap``. Terms that a frame lacks are not computed: a constant angular
     velocity has no Euler force, an origin at rest no origin force.
 
     ``turning`` gives attitude and rates; ``origin`` is None or a function of time that returns the
@@ -306,8 +309,8 @@ class RotatingFrame(eqx.Module):
     ) -> "RotatingFrame":
         """From an angular velocity along the rotating axes [rad/s]: constant, or a function of t.
 
-        ``wxyz`` is the attitude at ``t0``, axes aligned with space by default. With a function of
-        time the attitude is integrated from ``t0`` at each evaluation.
+        ``wxyz`` is the attitude at ``t0``, by default the identity. With a function of time the
+        attitude is integrated from ``t0`` at each evaluation.
         """
         varies = callable(omega_body)
         omega = None if varies else as_float_array("omega_body", omega_body, (3,))
@@ -335,12 +338,12 @@ class RotatingFrame(eqx.Module):
     ) -> "RotatingFrame":
         """From the attitude as a function of time: a matrix R(t) (3, 3) or a quaternion (4,).
 
-        Angular velocity and angular acceleration come from it by forward-mode differentiation.
+        Angular velocity and acceleration are computed from it by forward-mode differentiation.
         """
         if not callable(attitude):
             raise TypeError(
                 f"attitude must be a function of time, got {type(attitude).__name__}: for a frame"
-                " that turns steadily use RotatingFrame.from_rate."
+                " of constant angular velocity use RotatingFrame.from_rate."
             )
         name = "RotatingFrame.from_attitude"
         takes(name, attitude, ("t",))
@@ -348,11 +351,11 @@ class RotatingFrame(eqx.Module):
         t = jax.ShapeDtypeStruct((), jnp.result_type(float), weak_type=True)
         shapes: list[tuple[int, ...]] = []
 
-        def look(t):
+        def record_shape(t):
             value = attitude(t)
             shapes.append(() if value is None else jnp.shape(value))
 
-        jax.eval_shape(look, t)
+        jax.eval_shape(record_shape, t)
         shape = (3, 3) if shapes == [(3, 3)] else (4,)
         return cls(PrescribedAttitude(Signature(name, {"t": ()}, shape).checked(attitude)), origin)
 
@@ -366,8 +369,8 @@ class RotatingFrame(eqx.Module):
 
         Attitude, rate and angular acceleration are exact at the samples and interpolated between
         them with errors O(h^6), O(h^5), O(h^4) for samples h apart (`SampledAttitude`).
-        Raises ValueError for a batch of bodies, missing records, or samples half a revolution
-        apart.
+        Raises ValueError for a batch of bodies, missing attitudes or rates, or samples half a
+        revolution or more apart.
         """
         wxyz, omega = trajectory.wxyz, trajectory.omega_body
         if wxyz.ndim != 2:
@@ -388,14 +391,14 @@ class RotatingFrame(eqx.Module):
                 f"the body turns by up to {turn.max():.3g} rad between samples; less than pi is"
                 " needed to interpolate: pass more times to ph.simulate.",
             )
-        bend = angular_acceleration(trajectory)
-        return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, bend)), origin)
+        acceleration = angular_acceleration(trajectory)
+        return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, acceleration)), origin)
 
     # --- the frame itself -------------------------------------------------------------------------
 
     @property
     def is_uniform(self) -> bool:
-        """Whether the angular velocity is constant (static): there is no Euler force then."""
+        """Whether the angular velocity is constant (static), so that there is no Euler force."""
         return isinstance(self.turning, ConstantRate)
 
     def attitude(self, t: Time) -> Float[Array, "*b 4"]:
@@ -407,7 +410,7 @@ class RotatingFrame(eqx.Module):
         return self._rates(t)[0]
 
     def angular_acceleration(self, t: Time) -> Float[Array, "*b 3"]:
-        """Its derivative in frame components [rad/s^2]."""
+        """Derivative of the angular velocity in frame components [rad/s^2]."""
         omega, slope = self._rates(t)
         return jnp.zeros_like(omega) if slope is None else slope
 
@@ -442,7 +445,7 @@ class RotatingFrame(eqx.Module):
     # --- transformations, both ways (docs/equations.md, 003: 4-19) -----------------------
 
     def position_to_space(self, t: Time, position: Vector, *, wxyz: ArrayLike = None) -> Vector:
-        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
+        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude if known."""
         space_vector = self._rotate_to_space(t, position, wxyz)
         return space_vector if self.origin is None else _sum(space_vector, self._origin(t)[0])
 
@@ -490,7 +493,7 @@ class RotatingFrame(eqx.Module):
     # --- forces by name (docs/equations.md, 003: 20, 21) ---------------------------------
 
     def centrifugal(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
-        """Centrifugal force [N], ``-mass omega x (omega x r)``; zero on the axis."""
+        """Centrifugal force [N], ``-mass omega x (omega x r)``; zero on the rotation axis."""
         omega = self.omega_body(t)
         return _times(mass, -_cross(omega, _cross(omega, position)))
 
@@ -499,14 +502,14 @@ class RotatingFrame(eqx.Module):
         return _times(mass, -2 * _cross(self.omega_body(t), velocity))
 
     def euler(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
-        """Euler force [N], ``-mass d(omega)/dt x r``; plain zeros for a constant rate."""
+        """Euler force [N], ``-mass d(omega)/dt x r``; zero for a constant rate."""
         omega, slope = self._rates(t)
         if slope is None:
             return _no_force(mass, omega, vectors_like(omega, position))
         return _times(mass, -_cross(slope, position))
 
     def origin_force(self, t: Time, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
-        """Force of the accelerating origin [N], ``-mass R^T d2(origin)/dt2``."""
+        """Apparent force of an accelerated origin [N], ``-mass R^T d2(origin)/dt2``."""
         if self.origin is None:
             return _no_force(mass, self.omega_body(t))
         return _times(mass, -self._rotate_to_frame(t, self._origin(t)[2]))
@@ -522,9 +525,9 @@ class RotatingFrame(eqx.Module):
     def apparent_acceleration(
         self, t: Time, position: Vector, velocity: Vector | None = None, *, wxyz: ArrayLike = None
     ) -> Vector:
-        """All apparent forces per unit mass [m/s^2], of a particle at rest without ``velocity``.
+        """Sum of the apparent forces per unit mass [m/s^2]; ``velocity`` None: at rest in it.
 
-        Only the terms that this frame has are computed. ``wxyz``: the attitude, if it is known.
+        Only the terms that this frame has are computed. ``wxyz``: the attitude at ``t``, if known.
         """
         apparent = self._without_origin(t, position, velocity)
         if self.origin is None:
@@ -570,10 +573,10 @@ def accelerometer(
     the lever arm r from the point about which the body rotates. ``gravity_space`` (3,) [m/s^2] is
     for a body that rotates about a point fixed in space; leave it None for a body in free fall,
     where gravity and the acceleration of the mass centre cancel. Leading axes of positions
-    broadcast against the bodies: (n, 3) are n places on one body.
+    broadcast against the bodies: (n, 3) are n positions on one body.
 
     Raises ValueError if the trajectory has no rates (or no attitude where it is needed), or for
-    positions whose leading axes do not fit the bodies.
+    positions whose leading axes do not broadcast against the bodies.
     """
     omega = trajectory.omega_body
     lever = as_float_array("position_body", position_body, (3,)).astype(omega.dtype)

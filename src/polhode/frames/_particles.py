@@ -41,7 +41,7 @@ class FrameForce(eqx.Module):
 class SpaceForce(eqx.Module):
     """A force [N] in space components, ``function(t, position_space, velocity_space)``.
 
-    The attitude of the frame is computed at every step for it; a `FrameForce` needs none.
+    It needs the attitude of the frame at every step; a `FrameForce` does not.
     """
 
     function: Callable[[Array, Array, Array], Array] = _force("SpaceForce")
@@ -73,14 +73,14 @@ class ParticlePaths(eqx.Module):
 
 
 def _pushed(force, t, position, velocity):
-    """The force on all particles, checked to be one for each, or one for all."""
+    """The force on all particles, checked to be one vector for each or one for all."""
     name, arguments = type(force).__name__, (t, position, velocity)
 
     def broadcast_force(*arguments):
         value = jnp.asarray(force.function(*arguments))
         return jnp.broadcast_to(value, position.shape) if value.shape == (3,) else value
 
-    hint = "It sees all particles at one time."
+    hint = "It receives all particles at one time."
     shape, dtype = position.shape, position.dtype
     return result_of(name, _ARGUMENTS, broadcast_force, shape, dtype, *arguments, hint=hint)
 
@@ -106,7 +106,7 @@ def _size(vector: Array) -> Array:
 
 
 def _largest(tree) -> Array:
-    """Error norm: the worst component of the worst particle."""
+    """Error norm: the largest component of all particles."""
     return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]))
 
 
@@ -114,11 +114,11 @@ def _largest(tree) -> Array:
 def _solve(frame, force, mass, position, velocity, ts, rtol, solver, controller, adjoint, limit):
     turning = frame.turning
     needs_attitude = isinstance(force, SpaceForce) or frame.origin is not None
-    # A frame given by a rate alone has its attitude integrated along with the particles.
+    # The attitude of a frame with a variable rate is integrated together with the particles.
     along = needs_attitude and isinstance(turning, VariableRate)
     start = turning.attitude(ts[0]) if along else None
     push = _acceleration(frame, force, mass, ts[0], position, velocity, start)
-    # Natural units of each particle: what it has now, and what it gains by the second time.
+    # Units of length and speed of each particle: initial values plus the changes up to ``ts[1]``.
     step = jnp.abs(ts[1] - ts[0])
     length = _size(position) + step * _size(velocity) + step**2 * _size(push)
     length = jax.lax.stop_gradient(jnp.where(length > 0, length, jnp.ones_like(length)))
@@ -192,7 +192,7 @@ def simulate_particles(
     if not isinstance(force, FrameForce | SpaceForce | None):
         raise TypeError(
             f"force must be None, FrameForce(function) or SpaceForce(function), got"
-            f" {type(force).__name__}: the class tells in which axes the function works."
+            f" {type(force).__name__}: the class states the axes of the force."
         )
     solver = diffrax.Dopri8() if solver is None else solver
     check_options(solver, controller, adjoint, max_steps=max_steps)

@@ -108,8 +108,8 @@ class Inertia(AbstractShaped, AbstractPart):
         ``physical=False`` accepts published moments that violate the triangle inequality, such as
         (2, 1, 2/3); the equations of motion are the same.
 
-        Raises ValueError for a wrong shape, values that are not positive and finite, or moments
-        that no body has (flat bodies, where one equals the sum of the two others, pass).
+        Raises ValueError for a wrong shape, values that are not positive and finite, or unphysical
+        moments (flat bodies, where one equals the sum of the two others, are accepted).
         """
         array = as_float_array("moments", moments, (3,))
         return cls(diagonal=_checked("moments", array, physical), physical=physical)
@@ -142,14 +142,14 @@ class Inertia(AbstractShaped, AbstractPart):
 
         The off-diagonal entries are ``-integral x y dm``. ``physical`` as for
         ``from_moments``. Raises ValueError for a wrong shape, NaN or infinity, a tensor that is not
-        symmetric, or one whose principal moments are not positive or break the triangle
-        inequality. While the numbers are traced a tensor that is not symmetric becomes NaN.
+        symmetric, or one whose principal moments are not positive or violate the triangle
+        inequality. A traced tensor that is not symmetric becomes NaN.
         """
         array = as_float_array("tensor", tensor, (3, 3))
         check_tensor("tensor", array, triangle=physical)
         values = on_host(array)
         symmetric = (values + values.mT) / 2
-        if isinstance(values, np.ndarray):  # without compiling a program
+        if isinstance(values, np.ndarray):  # computed by NumPy, without compiling a program
             symmetric = as_float_array("tensor", symmetric)
         elif not is_concrete(array):
             symmetric = jnp.where(is_symmetric(array)[..., None, None], symmetric, jnp.nan)
@@ -176,7 +176,7 @@ class Inertia(AbstractShaped, AbstractPart):
 
     @classmethod
     def of_symmetry(cls, moments: Array, symmetry: Symmetry, physical: bool = True) -> Self:
-        """Moments (..., 3) in the form of a symmetry that they are known to have; unchecked."""
+        """Moments (..., 3) in the form for a symmetry that the caller guarantees; unchecked."""
         if symmetry is Symmetry.NONE:
             return cls(diagonal=moments, physical=physical)
         values = on_host(moments)
@@ -237,10 +237,10 @@ class Inertia(AbstractShaped, AbstractPart):
 
     @property
     def is_possible(self) -> Bool[Array, "*b"]:
-        """Whether (...) a body can have these numbers, up to rounding: also while they are traced.
+        """Whether (...) the inertia is physical, up to rounding; works under JAX transformations.
 
-        Positive moments that obey the triangle inequality (unless ``physical`` is False), a
-        symmetric tensor, neither NaN nor infinity.
+        It requires positive moments that satisfy the triangle inequality (unless ``physical`` is
+        False), a symmetric tensor, neither NaN nor infinity.
         """
         if self.full is None:
             return possible_moments(self.moments, self.physical)
@@ -250,7 +250,7 @@ class Inertia(AbstractShaped, AbstractPart):
     def axes(self) -> Float[Array, "*b 4"] | None:
         """Rotation ``wxyz`` (..., 4) from principal to body axes, or None when they are the same.
 
-        Carries no derivative (``principal`` says how to get derivatives right).
+        Carries no derivative (see ``principal`` for correct derivatives).
         """
         return None if self.full is None else principal(self.full)[1]
 
@@ -264,7 +264,7 @@ class Inertia(AbstractShaped, AbstractPart):
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
         """The body rotated by the unit quaternion (..., 4) in its axes: ``R I R^T``, a full tensor.
 
-        ``axes`` is such a rotation: ``Inertia(moments).turned(axes)`` is the body.
+        It inverts the decomposition: ``Inertia(inertia.moments).turned(inertia.axes)``.
         """
         return type(self)(
             full=rotate_tensor(self.tensor, wxyz_to_matrix(wxyz)), physical=self.physical
@@ -273,8 +273,8 @@ class Inertia(AbstractShaped, AbstractPart):
     def to_principal(self) -> tuple[Self, Float[Array, "*b 4"]]:
         """The body in principal axes, and the rotation ``wxyz`` from those to the present axes.
 
-        ``wxyz`` is a constant for derivatives, and the products of inertia about it are dropped:
-        for derivatives of a motion with respect to a full tensor use ``principal``.
+        ``wxyz`` has no derivatives, and the tangents of the products of inertia are dropped: for
+        derivatives of a motion with respect to a full tensor use ``principal``.
         """
         if self.full is None:
             unit = jnp.asarray([1, 0, 0, 0], self.dtype)
@@ -301,7 +301,7 @@ class Inertia(AbstractShaped, AbstractPart):
 
 
 def check_form(inertia: Inertia) -> None:
-    """ValueError unless the numbers stand in one form, of which they are all there."""
+    """ValueError unless exactly one form has numbers, and all of its numbers are present."""
     forms = (inertia.diagonal, inertia.full, inertia.transverse, inertia.moment)
     is_complete = (inertia.transverse is None) == (inertia.axial is None)
     if sum(x is not None for x in forms) != 1 or not is_complete:
@@ -324,7 +324,7 @@ def _diagonal(moments: Array) -> Array:
     return _diagonal_of(moments)
 
 
-@jax.jit  # one program, not one for each operation; likewise below
+@jax.jit  # outside jit too, one program for all operations; likewise below
 def _diagonal_of(moments):
     unit = jnp.eye(3, dtype=moments.dtype)
     return moments[..., None] * jnp.broadcast_to(unit, (*moments.shape, 3))
@@ -360,7 +360,7 @@ def _checked(name, moments, triangle=True):
 
 
 def _moments_meant(value) -> Array:
-    """The moments of ``ph.Inertia(value)``; an error that names the constructor otherwise."""
+    """The moments of ``ph.Inertia(value)``, or an error that names the right constructor."""
     if isinstance(value, eqx.Module):
         raise TypeError(
             f"Inertia takes numbers, got {type(value).__name__}: of ph.MassProperties take .inertia"
@@ -388,8 +388,8 @@ def angular_acceleration(
     """``domega/dt`` (..., 3), rad/s^2, of ``I domega/dt + omega x (I omega) = N``.
 
     ``omega_body`` rad/s and ``torque_body`` N m (None: free) in body axes; constant inertia, any
-    axes. Without ``omega x (I omega)``, as often printed, it is right only when that vanishes,
-    i.e. when omega is along a principal axis.
+    axes. The form without ``omega x (I omega)``, which is often printed, is correct only if omega
+    is along a principal axis.
     """
     omega_body = as_vectors("omega_body", omega_body)
     drive = _cross(inertia.momentum(omega_body), omega_body)
@@ -494,5 +494,5 @@ _NAME = "VariableInertia"
 
 
 def inertia_at(inertia: Inertia | VariableInertia, t: Array | float) -> Inertia:
-    """The inertia at the time ``t``; what does not change is returned as it is."""
+    """The inertia at the time ``t``; a constant one is returned unchanged."""
     return inertia.at(t) if isinstance(inertia, VariableInertia) else inertia

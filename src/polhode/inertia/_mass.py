@@ -62,7 +62,7 @@ class MassProperties(AbstractShaped, Printable):
 
     @classmethod
     def from_points(cls, masses: ArrayLike, positions: ArrayLike) -> Self:
-        """Point masses (..., n), kg, at ``positions`` (..., n, 3), m; any number from one up.
+        """Point masses (..., n), kg, at ``positions`` (..., n, 3), m, with n >= 1.
 
         Raises ValueError for an empty set, a negative mass, NaN or infinity.
         """
@@ -134,11 +134,11 @@ class MassProperties(AbstractShaped, Printable):
     def from_urdf(cls, path: str | PathLike[str], link: str) -> Self:
         """Mass properties of a link in a URDF file, in the axes of the link.
 
-        ``centre`` is measured from the origin of the link. SI units, as the format has them. Raises
-        FileNotFoundError, and ValueError for a file that is no URDF, a link that is not in it or
-        has no inertia, and moments that no body has.
+        ``centre`` is measured from the origin of the link. URDF files are in SI units. Raises
+        FileNotFoundError, and ValueError for a file that is not URDF, a link that is missing or
+        has no inertia, and unphysical moments.
         """
-        from polhode.inertia._robots import read_urdf  # here: SciPy loads with it
+        from polhode.inertia._robots import read_urdf  # imported here because it imports SciPy
 
         return cls._of_file(path, link, *read_urdf(path, link))
 
@@ -150,7 +150,7 @@ class MassProperties(AbstractShaped, Printable):
         element, MuJoCo computes one from the geoms. Raises as ``from_urdf``, and ImportError
         without mujoco (extra ``robots``).
         """
-        from polhode.inertia._robots import read_mjcf  # here: SciPy loads with it
+        from polhode.inertia._robots import read_mjcf  # imported here because it imports SciPy
 
         return cls._of_file(path, body, *read_mjcf(path, body))
 
@@ -163,7 +163,7 @@ class MassProperties(AbstractShaped, Printable):
         centre: np.ndarray,
         tensor: np.ndarray,
     ) -> Self:
-        """The errors name the part and the file."""
+        """The body from numbers of a file; errors name the part and the file."""
         try:
             return cls.of(mass, centre, Inertia.from_tensor(tensor))
         except ValueError as error:
@@ -198,7 +198,7 @@ class MassProperties(AbstractShaped, Printable):
 
     @property
     def inertia(self) -> Inertia:
-        """Inertia about the centre of mass; ValueError for that of a point or of a thin line."""
+        """Inertia about the centre of mass; ValueError for a point or a thin line."""
         if not self.central.is_principal:
             check_tensor("the inertia", self.central.tensor)
         elif is_concrete(self.central):
@@ -207,7 +207,7 @@ class MassProperties(AbstractShaped, Printable):
         return self.central
 
     def about(self, point: ArrayLike) -> Inertia:
-        """Inertia about a fixed ``point`` (..., 3) of the body, m (parallel-axis theorem)."""
+        """Inertia about a ``point`` (..., 3) [m] of the body, by the parallel-axis theorem."""
         at = as_float_array("point", point, (3,)).astype(self.mass.dtype)
         batch = (*batch_of(point=(at, 1), centre=(self.centre, 1)), 3)
         shift = jnp.broadcast_to(self.centre, batch) - jnp.broadcast_to(at, batch)
@@ -299,15 +299,15 @@ def as_triangles(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarr
 
 
 def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:
-    """``as_triangles`` of a closed, oriented surface.
+    """``as_triangles`` for a closed, oriented surface.
 
-    Raises ValueError when the surface has holes, faces wound against their neighbours, or
-    (vertices known) does not enclose a positive volume.
+    Raises ValueError if the surface has holes or faces of opposite orientation, or (for concrete
+    vertices) does not enclose a positive volume.
     """
     vertices, faces = as_triangles(vertices, faces)
     _check_closed(faces)
     if is_concrete(vertices) and vertices.size:
-        with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+        with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
             volume = np.asarray(mesh_integrals(vertices, faces)[0])
         require(
             volume > 0,
@@ -342,17 +342,17 @@ def _check_closed(faces: np.ndarray) -> None:
     )
 
 
-@jax.jit  # one program, not one for each operation
+@jax.jit  # outside jit too, one program for all operations
 def mesh_integrals(
     vertices: Float[Array, "*b v 3"], faces: Int[Array | np.ndarray, "f 3"]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Float[Array, "*b 3 3"]]:
-    """Volume, centre and central second moments (kg m^2 per kg m^-3) inside a closed mesh.
+    """Volume, centre and central second moments per density [m^5] inside a closed mesh.
 
-    Exact sums over the tetrahedra that the faces span with an inner point; differentiable with
+    Exact sums over the tetrahedra that the faces span with a common apex; differentiable with
     respect to the vertices (``integral x x^T`` over a tetrahedron with apex 0 and corners a, b, c
     is ``det(a, b, c)/120 (s s^T + a a^T + b b^T + c c^T)``, ``s = a + b + c``).
     """
-    # The integrals do not depend on the apex: it only keeps the summands small, so it is constant.
+    # The integrals do not depend on the apex, which only reduces rounding errors: no derivative.
     apex = jax.lax.stop_gradient(jnp.mean(vertices, axis=-2, keepdims=True))
     local = vertices - apex
     corners = [[local[..., faces[:, k], i] for i in range(3)] for k in range(3)]
@@ -377,7 +377,7 @@ def mesh_integrals(
 def load_mesh(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (v, 3) and faces (f, 3) of a mesh file (STL, OBJ, PLY, ...), read by trimesh.
 
-    Raises ImportError without trimesh, FileNotFoundError without the file, ValueError when it
+    Raises ImportError without trimesh, FileNotFoundError for a missing file, ValueError if it
     cannot be read as one mesh.
     """
     trimesh = imported("reading mesh files", "trimesh", extra="mesh")

@@ -8,9 +8,9 @@ physical body. With mass and centre of mass the same holds for the 4x4 pseudo-in
 2022, eqs. 8-13).
 
 The eigen-decomposition carries no derivative. The tensor in the (constant) principal axes,
-``Q^T I Q``, carries it: its diagonal holds the moments, and its off-diagonal entries are zero in
-value but not in tangent. Whatever is computed from both therefore has the derivative of the tensor,
-equal moments included.
+``Q^T I Q``, carries it: its diagonal entries are the moments, and its off-diagonal entries are zero
+in value but not in tangent. Functions of both therefore have the derivative with respect to the
+tensor, also for equal moments.
 
 Shapes are always checked, values only where they are concrete.
 """
@@ -38,15 +38,16 @@ from polhode._checks import (
 from polhode._kernels import are_close, kernel, over_gap, underivable
 from polhode.rotation._quaternion import matrix_row
 
-# Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
-# linearly fast before that. Sweeps beyond the last needed one do nothing (t = 0 exactly or below
-# rounding). 4 sweeps reach float32 and 6 float64 rounding on every tensor tried, clustered
-# moments included; float64 has one more as a margin.
+# Sweeps of cyclic Jacobi rotations by item size of the dtype. They converge quadratically once the
+# off-diagonal part is small compared with the differences of the moments, and linearly before.
+# Further sweeps do not change the result (t = 0 exactly or below rounding). In tests, clustered
+# moments included, 4 sweeps reached the rounding error of float32 and 6 that of float64; one more
+# is a margin.
 _SWEEPS = {2: 4, 4: 5, 8: 7}
 
 
 def _turn(q, axis, cosine, sine):
-    """Quaternion components of ``q`` followed, in body axes, by a turn about one body axis."""
+    """Quaternion components of ``q`` followed, in body axes, by a rotation about one body axis."""
     w, v = q[0], q[1:]
     p, s = (axis + 1) % 3, (axis + 2) % 3
     vector_part = [None, None, None]
@@ -81,7 +82,7 @@ def _rotate_plane(diagonal, off, q):
 
 
 def _ordered(diagonal, q):
-    """Moments ascending; an exchange of two axes is a quarter turn, so handedness is kept."""
+    """Moments in ascending order. Quarter turns exchange axes, which preserves handedness."""
     half = jnp.asarray(0.5, diagonal[0].dtype) ** 0.5
     for r in (2, 0, 2):
         p, s = (r + 1) % 3, (r + 2) % 3
@@ -102,7 +103,7 @@ def _jacobi(diagonal, off):
     q = (one, *(jnp.zeros_like(one) for _ in range(3)))
 
     def rotate(_, carry):
-        # with the axes renamed in turn, so that one rotation stands in the program for all three
+        # cyclic renaming of the axes: the program contains one rotation for all three planes
         diagonal, off, (w, *v) = _rotate_plane(*carry)
         diagonal, off, v = ((b, c, a) for a, b, c in (diagonal, off, v))
         return diagonal, off, (w, *v)
@@ -110,8 +111,9 @@ def _jacobi(diagonal, off):
     count = 3 * _SWEEPS[jnp.dtype(one.dtype).itemsize]
     diagonal, off, q = jax.lax.fori_loop(0, count, rotate, (diagonal, off, q))
     _, q = _ordered(diagonal, q)
-    # Of either sign. A scalar part that is zero but for rounding must not decide the sign: XLA may
-    # compute it anew for each component, rounded otherwise, and these then differ in sign.
+    # The sign is arbitrary. It must not be chosen by the scalar part, which may be zero up to
+    # rounding: XLA may recompute that for each component with other rounding, and the components
+    # would then have inconsistent signs.
     norm = jnp.sqrt(sum(c * c for c in q))
     return tuple(c / norm for c in q)
 
@@ -125,7 +127,7 @@ _DIAGONAL, _OFF_DIAGONAL = ((0, 0), (1, 1), (2, 2)), ((1, 2), (2, 0), (0, 1))
 
 
 def _total(terms: Iterable[Array]) -> Array:
-    """Their sum; ``jnp.sum`` would round otherwise."""
+    """The sum in this order; ``jnp.sum`` would round differently."""
     return reduce(add, terms)
 
 
@@ -139,27 +141,28 @@ def principal(
     z), (z, x), (x, y) of ``R^T I R``, which are zero in value.
 
     Derivatives: ``wxyz`` carries none. ``moments`` and ``products`` carry those of ``R^T I R`` at
-    fixed R, which exist for equal moments too; for separate moments those of ``moments`` are the
-    usual ones. What depends on the tensor alone has its right derivative when it is computed from
-    moments, products and wxyz together. This holds to first order: the second derivative of an
-    eigenvalue depends on the rotation of the axes, which is omitted (see ``principal_moments``).
+    fixed R, which exist for equal moments too; for distinct moments those of ``moments`` are the
+    usual derivatives of eigenvalues. A function of the tensor that is computed from moments,
+    products and wxyz together has the correct derivative. This holds to first order: the second
+    derivative of an eigenvalue depends on the rotation of the axes, which is omitted (see
+    ``principal_moments``).
     """
     return _principal(_as_tensors(tensor))
 
 
 def _as_tensors(value: Any, name: str = "tensor") -> Array:
-    """Tensors (..., 3, 3) of floats, also from lists; NaN passes, and arrays at no cost."""
+    """Tensors (..., 3, 3) of floats, also from lists. NaN is accepted; JAX arrays are unchanged."""
     fits = isinstance(value, jax.Array) and value.shape[-2:] == (3, 3)
     if fits and jnp.issubdtype(value.dtype, jnp.floating):
         return value
     return as_float_array(name, value, (3, 3), finite=False)
 
 
-@jax.jit  # a hundred operations: outside of a program each would be one of its own
+@jax.jit  # outside jit too, one program for its hundred operations
 @kernel  # compiles in half the time
 def _principal(tensor: Array) -> tuple[Array, Array, Array]:
-    # Rows and columns are the first axes, and whole arrays are multiplied: written entry by entry
-    # the program takes twice as long to compile.
+    # Rows and columns are the leading axes of arrays that are multiplied elementwise: written for
+    # each entry separately, the program would compile for twice as long.
     tensor = jnp.moveaxis(tensor, (-2, -1), (0, 1))
     tensor = (tensor + jnp.swapaxes(tensor, 0, 1)) / 2
     fixed = jax.lax.stop_gradient(tensor)
@@ -173,7 +176,7 @@ def _principal(tensor: Array) -> tuple[Array, Array, Array]:
     moments, products = (
         jnp.stack([turned[i, j] for i, j in pairs]) for pairs in (_DIAGONAL, _OFF_DIAGONAL)
     )
-    # Rayleigh quotients: the rounding of the quaternion's norm drops out
+    # Rayleigh quotients: independent of the rounding error of the quaternion's norm
     moments = moments / _total(columns[:, k] * columns[:, k] for k in range(3))
     products = products - jax.lax.stop_gradient(products)
     return jnp.moveaxis(moments, 0, -1), jnp.stack(q, axis=-1), jnp.moveaxis(products, 0, -1)
@@ -181,10 +184,10 @@ def _principal(tensor: Array) -> tuple[Array, Array, Array]:
 
 @jax.jit
 def principal_moments(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
-    """The moments of ``principal``, with their second derivatives too.
+    """The moments of ``principal``, with correct second derivatives.
 
-    Those are NaN where two moments agree to half of their digits and the principal axes turn:
-    there eigenvalues have no second derivatives.
+    These are NaN where two moments agree to half of their digits and the change of the tensor
+    rotates the principal axes: eigenvalues have no second derivatives there.
     """
     moments, _, products = principal(tensor)
     return _curved(moments, products)
@@ -212,7 +215,7 @@ def _curved_rule(primals, tangents):
 
 
 def symmetric(diagonal, off):
-    """Matrix (..., 3, 3) of its diagonal and the entries (y, z), (z, x), (x, y)."""
+    """Symmetric matrix (..., 3, 3) with a diagonal and the entries (y, z), (z, x), (x, y)."""
     (a, b, c), (p, q, r) = diagonal, off
     rows = [[a, r, q], [r, b, p], [q, p, c]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
@@ -243,13 +246,14 @@ def _upper_product(d1, d2, d3, s12, s13, s23):
 
 
 def _upper_factor(sigma):
-    """The upper triangle S of ``sigma = S S^T``, its diagonal positive, or zero for a flat body."""
+    """The upper triangle S of ``sigma = S S^T``, with a diagonal that is positive, or zero for a
+    flat body."""
     trace = sigma[..., 0, 0] + sigma[..., 1, 1] + sigma[..., 2, 2]
-    limit = -tolerance(sigma) * trace  # as far beyond the boundary as the constructors accept
+    limit = -tolerance(sigma) * trace  # rounding errors that the constructors accept as well
 
     def root(square):
         is_positive = square > 0
-        zero = jnp.where(square >= limit, 0.0, jnp.nan).astype(square.dtype)  # NaN: of no body
+        zero = jnp.where(square >= limit, 0.0, jnp.nan).astype(square.dtype)  # NaN: unphysical
         return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1)), zero)
 
     d3 = root(sigma[..., 2, 2])
@@ -261,7 +265,7 @@ def _upper_factor(sigma):
 
 
 def _quotient(entry, diagonal):
-    """An entry of a column over the diagonal one; 0 where that is 0, as is the column then."""
+    """An entry of a column over its diagonal entry; 0 if that is 0, as the column is zero then."""
     is_zero = diagonal == 0
     return jnp.where(is_zero, 0, entry / jnp.where(is_zero, 1, diagonal))
 
@@ -270,7 +274,7 @@ def inertia_from_log_cholesky(parameters: Float[ArrayLike, "*b 6"]) -> Float[Arr
     """Inertia tensor (..., 3, 3) of ``(d1, d2, d3, n12, n13, n23)``, any real numbers.
 
     ``Sigma = S S^T`` with ``S = N diag(exp d)`` and N unit upper triangular: adding a constant
-    to the three d scales the body and changes nothing else. d in log of sqrt(kg) m, n without unit.
+    to the three d scales the body and changes nothing else. exp(d) in sqrt(kg) m, n dimensionless.
     """
     *logarithms, n12, n13, n23 = jnp.unstack(as_vectors("parameters", parameters, 6), axis=-1)
     d1, d2, d3 = map(jnp.exp, logarithms)
@@ -281,8 +285,8 @@ def inertia_from_log_cholesky(parameters: Float[ArrayLike, "*b 6"]) -> Float[Arr
 def inertia_to_log_cholesky(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 6"]:
     """Inverse of ``inertia_from_log_cholesky``.
 
-    Of a flat body, which is on the boundary, a logarithm is ``-inf``, and the entries of its column
-    are 0; NaN for a tensor that no body has.
+    For a flat body, which is on the boundary, a logarithm is ``-inf``, and the entries of its
+    column are 0; NaN for an unphysical tensor.
     """
     d1, d2, d3, s12, s13, s23 = _upper_factor(second_moments(tensor))
     logs = [jnp.log(d1), jnp.log(d2), jnp.log(d3)]
@@ -293,7 +297,7 @@ def inertia_to_log_cholesky(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, 
 def pseudo_from_log_cholesky(
     parameters: Float[Array, "*b 10"],
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Float[Array, "*b 3 3"]]:
-    """Mass, centre of mass and inertia about it of the ten parameters of Rucker and Wensing.
+    """Mass, centre of mass and inertia about it from the ten parameters of Rucker and Wensing.
 
     ``(alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3)``; ``J = U U^T`` with
     ``U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2], [0, 0, exp d3, t3],
@@ -317,7 +321,7 @@ def pseudo_to_log_cholesky(
 
 
 def physical_margin(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b"]:
-    """Signed distance (...), kg m^2, of a tensor to the boundary of the physical ones.
+    """Signed distance (...), kg m^2, of a tensor from the boundary of the physical ones.
 
     A tensor belongs to a body exactly when its second moments ``Sigma = tr(I)/2 - I`` have no
     negative eigenvalue: positive moments and the triangle inequality in one. The distance is that
@@ -328,23 +332,22 @@ def physical_margin(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b"]:
     negative = jnp.minimum(eigenvalues, 0)
     outside = eigenvalues[..., 0] < 0
     square = jnp.sum(negative * negative, axis=-1)
-    # both branches must be differentiable where the other one is taken
+    # both branches of ``where`` must have finite derivatives
     distance = jnp.sqrt(jnp.where(outside, square, 1))
     return jnp.where(outside, -distance, eigenvalues[..., 0])
 
 
 def is_physical(tensor: Float[ArrayLike, "*b 3 3"], slack: float = 0.0) -> Array:
-    """Whether (...) a body can have this tensor; ``slack``: tolerance relative to its trace."""
+    """Whether (...) a tensor is physical; ``slack``: tolerance relative to its trace."""
     tensor = _as_tensors(tensor)
     trace = tensor[..., 0, 0] + tensor[..., 1, 1] + tensor[..., 2, 2]
     return physical_margin(tensor) >= -slack * trace
 
 
 def possible_moments(moments: Float[Array, "*b 3"], triangle: bool) -> Bool[Array, "*b"]:
-    """Whether moments are positive and finite and, with ``triangle``, those of a body.
+    """Whether moments are positive and finite and, with ``triangle``, satisfy that inequality.
 
-    The tolerance is that of the constructors; nothing is looked for, so that it costs a few
-    operations in a compiled program.
+    With the tolerance of the constructors. It costs a few operations in a compiled program.
     """
     moments = on_host(moments, weak=True)
     xp = numbers(moments)
@@ -362,9 +365,9 @@ def possible_moments(moments: Float[Array, "*b 3"], triangle: bool) -> Bool[Arra
 
 
 def possible_tensor(tensor: Float[Array, "*b 3 3"], triangle: bool) -> Bool[Array, "*b"]:
-    """Whether a tensor is symmetric, positive and, with ``triangle``, that of a body.
+    """Whether a tensor is symmetric, positive definite and, with ``triangle``, physical.
 
-    Definiteness shows in the pivots of elimination, which need no eigenvalues.
+    Definiteness is tested by the pivots of Gaussian elimination, without eigenvalues.
     """
     tensor = jax.lax.stop_gradient(tensor)
     unit = tensor / jnp.max(jnp.abs(tensor), axis=(-2, -1), keepdims=True)
@@ -380,7 +383,7 @@ def possible_tensor(tensor: Float[Array, "*b 3 3"], triangle: bool) -> Bool[Arra
 
 
 def is_symmetric(tensor: Float[Array, "*b 3 3"]) -> Bool[Array, "*b"]:
-    """Whether tensors are symmetric, up to the tolerance of the constructors; NaN is not."""
+    """Whether tensors are symmetric, to the tolerance of the constructors; False for NaN."""
     tensor = jax.lax.stop_gradient(tensor)
     skew = jnp.max(jnp.abs(tensor - jnp.swapaxes(tensor, -1, -2)), axis=(-2, -1))
     return skew <= tolerance(tensor) * jnp.max(jnp.abs(tensor), axis=(-2, -1))
@@ -396,7 +399,7 @@ def _is_positive(matrix: Array) -> Array:
 
 
 def tolerance(array: Array) -> float:
-    """Relative tolerance of consistency checks: the square root of the dtype's rounding."""
+    """Relative tolerance of consistency checks: the square root of the dtype's epsilon."""
     return float(np.sqrt(jnp.finfo(array.dtype).eps))
 
 
@@ -412,25 +415,24 @@ def require_below(small_name: str, small: Array, large_name: str, large: Array) 
 
 
 def check_moments(name: str, moments: np.ndarray, slack: float, zero_fraction: float = 0.0) -> None:
-    """ValueError unless rows of principal moments are positive and obey the triangle inequality.
+    """ValueError unless moments (..., 3) are positive and satisfy the triangle inequality.
 
     ``slack`` is the relative tolerance of the inequality (flat bodies), ``zero_fraction`` the part
     of the largest moment that counts as zero.
     """
     if moments.size == 0:
         return
-    columns = tuple(
-        moments[..., i] for i in range(moments.shape[-1])
-    )  # NumPy reduces long axes faster
+    # by columns: NumPy reduces a short last axis slowly
+    columns = tuple(moments[..., i] for i in range(moments.shape[-1]))
     largest, smallest = reduce(np.maximum, columns), reduce(np.minimum, columns)
     require(
         smallest > zero_fraction * largest,
         lambda: (
             f"{name} must be positive (kg m^2), got {_worst(moments, smallest)}; a moment is zero"
-            " only for a point or a thin line, which cannot turn about itself: give it a width."
+            " only for a point or an infinitely thin line: give the body a width."
         ),
     )
-    excess = 2 - sum(x / largest for x in columns)  # of any size: nothing overflows
+    excess = 2 - sum(x / largest for x in columns)  # relative, so that nothing overflows
     require(
         excess <= slack,
         lambda: (
@@ -443,9 +445,9 @@ def check_moments(name: str, moments: np.ndarray, slack: float, zero_fraction: f
 
 
 def check_tensor(name: str, array: Array, *, triangle: bool = True) -> None:
-    """ValueError unless a concrete tensor is symmetric with moments that a body can have.
+    """ValueError unless a concrete tensor is symmetric with positive principal moments.
 
-    ``triangle``: whether these must obey the triangle inequality.
+    ``triangle``: whether these must satisfy the triangle inequality.
     """
     if not is_concrete(array) or array.size == 0:
         return
@@ -457,7 +459,7 @@ def check_tensor(name: str, array: Array, *, triangle: bool = True) -> None:
         f"{name} must be symmetric, got entries that differ by up to {skew.max():g} from their "
         "transposed ones; pass (A + A.T) / 2 if that is what is meant.",
     )
-    # moments within the rounding of the largest cannot be told from zero
+    # moments below the rounding error of the largest one count as zero
     zero_fraction = 64 * float(jnp.finfo(array.dtype).eps)
     moments = np.linalg.eigvalsh((entries + mirrored) / 2)
     slack = tolerance(array) if triangle else np.inf
@@ -495,7 +497,7 @@ def of_points(
 
 
 def offset(mass: Float[Array, "*b"], shift: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """What a mass at distance ``shift`` (..., 3) adds: ``m (d.d 1 - d d^T)`` (Steiner)."""
+    """Contribution of a mass at ``shift`` (..., 3): ``m (d.d 1 - d d^T)`` (parallel axes)."""
     return of_points(mass[..., None], shift[..., None, :])
 
 
@@ -504,6 +506,6 @@ def rotate_tensor(
     tensor: Float[Array, "*#b 3 3"], matrix: Float[Array, "*#b 3 3"]
 ) -> Float[Array, "*b 3 3"]:
     """``R I R^T``, exactly symmetric."""
-    exact = jax.lax.Precision.HIGHEST  # accelerators may round matrix products more coarsely
+    exact = jax.lax.Precision.HIGHEST  # accelerators may compute matrix products less precisely
     product = jnp.einsum("...ij,...jk,...lk->...il", matrix, tensor, matrix, precision=exact)
     return (product + jnp.swapaxes(product, -1, -2)) / 2

@@ -23,7 +23,7 @@ def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, 
         raise ValueError(
             f"the root element of {name} is <{root.tag}>, a URDF file has <robot>{hint}."
         )
-    # links of the robot itself: extensions, such as <gazebo>, hold others
+    # only links of the robot itself: extensions such as <gazebo> contain others
     names = [element.get("name") for element in root.findall("link")]
     if names.count(link) != 1:
         how_many = "no link" if link not in names else f"{names.count(link)} links"
@@ -51,7 +51,8 @@ def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, 
 
 
 def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, np.ndarray]:
-    """The same of a body of an MJCF file, as MuJoCo compiles it (inertia from geoms included)."""
+    """Mass, centre of mass (3,) and tensor (3, 3) about it of a body in an MJCF file, as compiled
+    by MuJoCo (which computes a missing inertia from the geoms)."""
     mujoco = imported("from_mjcf", "mujoco", extra="robots")
     if not Path(path).is_file():
         raise FileNotFoundError(f"no such file: {path}")
@@ -95,5 +96,5 @@ def _three(element: Any, key: str, where: str) -> np.ndarray:
 
 
 def _hint(text: str | None) -> str:
-    """What to do about a value that only xacro computes."""
+    """A hint for an error message about an unexpanded xacro expression."""
     return " (expand the file by xacro first)" if text is not None and "${" in text else ""

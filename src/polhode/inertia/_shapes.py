@@ -1,7 +1,7 @@
-"""Homogeneous bodies of simple shape: their masses, centres and principal moments.
+"""Homogeneous bodies of simple shape: principal moments about the centre of mass.
 
-Formulas in closed form without differences of nearly equal numbers, so that thin walls keep full
-accuracy; each is checked against its defining integral in the tests.
+The closed-form formulas avoid differences of nearly equal numbers, so that they remain accurate for
+thin walls; the tests compare each with its defining integral.
 """
 
 import abc
@@ -20,7 +20,7 @@ from polhode.inertia._physical import require_below
 
 
 class Symmetry(enum.Enum):
-    """Which moments are known, by construction, to be equal (static: it selects the program)."""
+    """Which moments are equal by construction (static: it selects the program)."""
 
     NONE = "no two moments known to be equal"
     AXISYMMETRIC = "the moments about body x and y are equal"
@@ -47,8 +47,8 @@ class AbstractShaped(eqx.Module):
     """Constructors from homogeneous simple shapes, all centred on the centre of mass.
 
     Masses in kg (positive), lengths in m; leading axes of the arguments broadcast to a batch.
-    Rotational symmetry axes are body z, so that the result knows its symmetry. Every constructor
-    raises ValueError for a negative mass or length, NaN, infinity, or a wrong shape.
+    Axes of rotational symmetry are body z, and the result has that symmetry by construction. Every
+    constructor raises ValueError for a negative mass or length, NaN, infinity, or a wrong shape.
     """
 
     @classmethod
@@ -75,7 +75,7 @@ class AbstractShaped(eqx.Module):
         squares = []
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            # a_i a_j a_k - b_i b_j b_k and the same with cubes in i, as sums of positive terms
+            # a_i a_j a_k - b_i b_j b_k and a_i^3 a_j a_k - b_i^3 b_j b_k as sums of positive terms
             face = a[..., j] * a[..., k]
             face_wall = wall[..., j] * a[..., k] + b[..., j] * wall[..., k]
             volume = wall[..., i] * face + b[..., i] * face_wall
@@ -123,7 +123,7 @@ class AbstractShaped(eqx.Module):
 
     @classmethod
     def from_disc(cls, mass: ArrayLike, radius: ArrayLike, inner_radius: ArrayLike = 0.0) -> Self:
-        """A flat disc or ring normal to body z; the flattest body there is (Iz = Ix + Iy)."""
+        """A flat disc or ring normal to body z, at the limit of physical bodies (Iz = Ix + Iy)."""
         lengths = {"radius": radius, "inner_radius": inner_radius}
         mass, radius, inner = _sized(mass, lengths, _HOLLOW)
         axial = (radius**2 + inner**2) / 2
@@ -131,8 +131,8 @@ class AbstractShaped(eqx.Module):
 
     @classmethod
     def from_rod(cls, mass: ArrayLike, length: ArrayLike, radius: ArrayLike = 0.0) -> Self:
-        """A round rod along body z. A rod of radius 0 has no moment about its axis: use it only as
-        a part of a composite body."""
+        """A round rod along body z. A rod of radius 0 has a zero moment about its axis: use it only
+        as a part of a composite body."""
         lengths = {"length": length, "radius": radius}
         mass, length, radius = _sized(mass, lengths, {"radius": None})
         axial = radius**2 / 2
@@ -170,10 +170,10 @@ def _sized(
     inner: Mapping[str, str | None] | None = None,
     core: tuple[int, ...] = (),
 ) -> tuple[Array, ...]:
-    """Mass and lengths (..., *core) as floats with common batch axes; ValueError for wrong ones.
+    """Mass and lengths (..., *core) as floats with common batch axes; ValueError for invalid ones.
 
-    All must be positive, but for those of ``inner``: they may be zero and must not exceed the one
-    named (None: any).
+    All must be positive, except those in ``inner``, which may be zero and must not exceed the
+    length that ``inner`` names (None: no limit).
     """
     inner = inner or {}
     arrays = as_floats(mass=(mass, ()), **{name: (x, core) for name, x in lengths.items()})
@@ -183,6 +183,6 @@ def _sized(
     for name, outer in inner.items():
         if outer is not None:
             require_below(name, arrays_by_name[name], outer, arrays_by_name[outer])
-    # so that the formulas compile nothing where the numbers are known
+    # concrete numbers as NumPy arrays, for which the formulas need no compilation
     some_strong = any(not x.weak_type for x in arrays)
     return tuple(on_host(x, weak=some_strong) for x in arrays)

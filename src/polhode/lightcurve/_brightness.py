@@ -1,4 +1,4 @@
-"""Magnitudes of bodies: laws of scattering, phase functions, shapes, and the model of a fit."""
+"""Magnitudes of bodies: scattering laws, phase functions, shapes, and the model of a fit."""
 
 import math
 from functools import partial
@@ -16,10 +16,10 @@ from polhode._closed_forms import free_motion, principal_periods
 from polhode._closed_forms._free_constants import Triple
 from polhode.inertia._mass import check_mesh
 
-# Light scattered by a convex body, integrated over what is both lit and seen.
+# Light scattered by a convex body, integrated over the surface that is both lit and visible.
 #
-# A surface element of area dA sends ``mu mu0 / (mu + mu0) dA`` to the observer by the law of
-# Lommel and Seeliger, ``mu mu0 dA`` by Lambert's; mu and mu0 are the cosines of emergence and
+# A surface element of area dA scatters ``mu mu0 / (mu + mu0) dA`` to the observer by the
+# Lommel-Seeliger law, ``mu mu0 dA`` by Lambert's law; mu and mu0 are the cosines of emergence and
 # incidence. Directions point from the body to the Sun and to the observer, in body axes.
 
 Scalars = Float[Array, "*b"]
@@ -58,9 +58,9 @@ def seeliger_ellipsoid(
     ``axes``: semi-axes along x, y, z; ``sun``, ``observer``: unit vectors in body axes; each an
     array (..., 3), or a tuple or list of the three components, which broadcast together. Scale:
     pi a^2 / 2 for a sphere at opposition. Raises ValueError for another number of components.
-    Source: Muinonen & Lumme, Astron. Astrophys. 584 (2015) A23, here without angles: in the space
-    where the ellipsoid is a unit sphere only squares of sines occur, so that value and derivatives
-    are right at opposition too. Zero, with derivative zero, at a phase angle of exactly pi.
+    Source: Muinonen & Lumme, Astron. Astrophys. 584 (2015) A23, here without angles: in coordinates
+    in which the ellipsoid is a unit sphere, only squares of sines occur, so that value and
+    derivatives are accurate at opposition too. Zero, with derivative zero, at a phase angle of pi.
     """
     a, b, c = _components("axes", axes)
     toward = tuple(x / y for x, y in zip(_components("sun", sun), (a, b, c)))
@@ -75,12 +75,12 @@ def seeliger_ellipsoid(
     cosine_lit = (lit2 + product) / (lit * size)
     cosine_seen = (seen2 + product) / (visible * size)
     across = _cross(toward, away)
-    # sin p sin q of the two angles from the terminator and the limb to the bisecting plane
+    # sin p sin q, with the angles p, q from the terminator and from the limb to the bisecting plane
     sines = _dot(across, across) / (lit * visible * size2)
     open_ = sines > 0
     inner = jnp.where(open_, sines, 1)
     ratio = inner / ((1 + cosine_lit) * (1 + cosine_seen))
-    # x log x: at x = 0 its slope is infinite, but sines is of second order there
+    # x log x has an infinite derivative at x = 0, but ``sines`` is of second order there
     bend = jnp.where(open_, inner * jnp.log(jnp.where(dark, 1, ratio)), 0)
     total = cosine_lit + cosine_seen + bend
     return jnp.where(dark, 0, math.pi / 2 * a * b * c * lit * visible / size * total)
@@ -88,7 +88,7 @@ def seeliger_ellipsoid(
 
 @jax.jit
 def seeliger_sphere(alpha: Scalars) -> Scalars:
-    """Lommel-Seeliger brightness of a sphere over that at opposition; ``alpha`` in [0, pi]."""
+    """Lommel-Seeliger brightness of a sphere relative to opposition; ``alpha`` in [0, pi] [rad]."""
     half = alpha / 2
     quarter = jnp.where(half > 0, jnp.tan(half / 2), 1)
     below = jnp.where(half < math.pi / 2, half, 0)
@@ -104,11 +104,10 @@ def facets(
     lambert: float | Scalars = 0.0,
     seeliger: float | Scalars = 1.0,
 ) -> Scalars:
-    """Brightness of convex bodies of plane facets: ``seeliger`` and ``lambert`` parts of the laws.
+    """Brightness of convex bodies of plane facets, by a mixture of two scattering laws.
 
-    ``normals``: outward unit vectors; ``areas`` of the facets, in which their albedo may be
-    included. The sum over the facets both lit and seen of
-    ``mu mu0 (seeliger / (mu + mu0) + lambert) area``.
+    ``normals``: outward unit vectors; ``areas`` of the facets, which may include their albedo. The
+    sum of ``mu mu0 (seeliger / (mu + mu0) + lambert) area`` over the facets both lit and visible.
     """
     incidence = jnp.maximum(sun @ normals.T, 0)
     emergence = jnp.maximum(observer @ normals.T, 0)
@@ -122,21 +121,21 @@ def facets(
     return jnp.sum(jnp.broadcast_to(areas, shape) * incidence * emergence * law, axis=-1)
 
 
-# Phase functions: the brightness of a sphere over that at opposition, by phase angle.
+# Phase functions: brightness as a function of the phase angle, relative to opposition.
 
 
 class AbstractPhase(eqx.Module):
-    """A phase function; ``typical``: its coefficients where nothing is known."""
+    """A phase function; ``typical``: prior means of its coefficients."""
 
     typical: eqx.AbstractClassVar[tuple[float, ...]]
 
     def magnitudes(self, alpha: Scalars, coefficients: Float[Array, "*#b c"]) -> Scalars:
-        """Magnitudes above opposition at phase angles ``alpha`` [rad]."""
+        """Magnitudes at phase angles ``alpha`` [rad], minus those at opposition."""
         raise NotImplementedError
 
 
 class SeeligerPhase(AbstractPhase):
-    """What the law of Lommel and Seeliger gives by itself; no coefficients."""
+    """Phase function of a sphere with the Lommel-Seeliger law; no coefficients."""
 
     typical: ClassVar[tuple[float, ...]] = ()
 
@@ -145,7 +144,7 @@ class SeeligerPhase(AbstractPhase):
 
 
 class LinearPhase(AbstractPhase):
-    """``beta alpha``, beta in magnitudes per degree; fair between about 5 and 70 degrees."""
+    """``beta alpha``, beta in magnitudes per degree; valid between about 5 and 70 degrees."""
 
     typical: ClassVar[tuple[float, ...]] = (0.033,)
 
@@ -182,7 +181,7 @@ class HG1G2(AbstractPhase):
 _BOWELL = ((3.332, 0.631, 0.986), (1.862, 1.218, 0.238))
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3))  # one program, not one for each operation
+@partial(jax.jit, static_argnums=(1, 2, 3))  # outside jit too, one program for all operations
 def _bowell(alpha, a, b, c):
     sine, tangent = jnp.sin(alpha), jnp.tan(alpha / 2)
     far = jnp.exp(-a * jnp.where(tangent > 0, tangent, 1) ** b)
@@ -192,8 +191,9 @@ def _bowell(alpha, a, b, c):
     return weight * near + (1 - weight) * far
 
 
-# Values and slopes (per radian) at the knots: Muinonen et al. 2010, tables 3 and 4; the slopes are
-# those of the cubic splines with the printed end slopes (Penttila et al. 2016, PSS 123, 117).
+# Values and derivatives (per radian) at the knots: Muinonen et al. 2010, tables 3 and 4, with
+# derivatives of the cubic splines for the printed end derivatives (Penttila et al. 2016, PSS 123,
+# 117).
 _KNOTS = np.radians([7.5, 30.0, 60.0, 90.0, 120.0, 150.0])
 _FIRST = (
     (0.75, 0.33486016, 0.13410560, 0.051104756, 0.021465687, 0.0036396989),
@@ -231,7 +231,7 @@ _THIRD = (
 
 
 def _spline(knots, table, alpha):
-    """The cubic of given values and slopes at its ends, between the knots."""
+    """Cubic Hermite spline of a ``table`` (values, derivatives) at ``knots``."""
     dtype = alpha.dtype
     knots, values, slopes = (jnp.asarray(x, dtype) for x in (knots, *table))
     k = jnp.clip(jnp.searchsorted(knots, alpha, side="right") - 1, 0, knots.size - 2)
@@ -244,7 +244,7 @@ def _spline(knots, table, alpha):
 
 @jax.jit
 def hg1g2_basis(alpha: Scalars) -> tuple[Scalars, Scalars, Scalars]:
-    """The three functions of the H, G1, G2 system at ``alpha`` [rad]."""
+    """The three basis functions of the H, G1, G2 system at ``alpha`` [rad]."""
     out = []
     for table, slope in ((_FIRST, -6 / math.pi), (_SECOND, -9 / (5 * math.pi))):
         value = _spline(_KNOTS, table, alpha)
@@ -256,14 +256,14 @@ def hg1g2_basis(alpha: Scalars) -> tuple[Scalars, Scalars, Scalars]:
     return out[0], out[1], third
 
 
-# Convex bodies by their facets: from a mesh, an ellipsoid, or harmonics of their curvature.
+# Convex bodies as facets: from a mesh, an ellipsoid, or spherical harmonics of the surface density.
 
 
 class Convex(NamedTuple):
     """Facets of a convex body: outward ``normals`` (f, 3) and ``areas`` (..., f).
 
-    A convex body's light depends on its area per solid angle of normal only (its Gaussian surface
-    density, one over the curvature), of which these are samples.
+    The light of a convex body depends only on its surface area per solid angle of the normal (the
+    Gaussian surface density, the inverse of the curvature), which the facets sample.
     """
 
     normals: Float[Array, "f 3"]
@@ -271,7 +271,7 @@ class Convex(NamedTuple):
 
     @classmethod
     def from_mesh(cls, vertices: ArrayLike, faces: ArrayLike) -> "Convex":
-        """A closed triangle mesh (v, 3), (f, 3); what it hides from itself is not accounted for."""
+        """A closed triangle mesh (v, 3), (f, 3); shadows of the mesh on itself are neglected."""
         vertices, faces = check_mesh(vertices, faces)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         across = jnp.cross(b - a, c - a)
@@ -291,8 +291,8 @@ class Convex(NamedTuple):
         """Density exp(sum of coefficients times real spherical harmonics).
 
         ``coefficients`` (..., (l + 1)^2) in the order l = 0; 1, m = -1, 0, 1; ... of `harmonics`.
-        Always positive; the surface closes, and a body exists (Minkowski), where the sum of
-        ``areas`` times ``normals`` vanishes: `unclosed` measures that.
+        The density is always positive. The surface closes, and such a body exists (Minkowski), if
+        the sum of ``areas`` times ``normals`` vanishes: see `unclosed`.
         """
         coefficients = jnp.asarray(coefficients)
         degree = math.isqrt(coefficients.shape[-1]) - 1
@@ -306,7 +306,7 @@ class Convex(NamedTuple):
 
     @property
     def unclosed(self) -> Scalars:
-        """|sum of areas times normals| over the whole area; 0 for a closed surface."""
+        """|sum of areas times normals| over the total area; 0 for a closed surface."""
         rest = self.areas @ self.normals
         return jnp.sqrt(jnp.sum(rest * rest, axis=-1)) / jnp.sum(self.areas, axis=-1)
 
@@ -318,7 +318,9 @@ class Convex(NamedTuple):
         lambert: Array | float = 0.0,
         seeliger: Array | float = 1.0,
     ) -> Scalars:
-        """Of bodies lit and seen from directions (..., 3), unit vectors in body axes: see `facets`.
+        """Brightness for directions (..., 3) to ``sun`` and ``observer``: see `facets`.
+
+        Both are unit vectors in body axes.
 
         Raises ValueError for vectors of another shape.
         """
@@ -330,7 +332,7 @@ class Convex(NamedTuple):
 
 
 def _sphere(count: int):
-    """``count`` directions (n, 3) spread evenly on a spiral, and the solid angle of each."""
+    """``count`` directions (n, 3) evenly distributed on a spiral, and the solid angle of each."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     turn = np.pi * (1 + 5**0.5) * k
@@ -367,11 +369,12 @@ def harmonics(directions: Float[Array, "n 3"], degree: int) -> Float[Array, "k n
     return jnp.stack([rows[l, m] for l in range(degree + 1) for m in range(-l, l + 1)])
 
 
-# Magnitudes of a free ellipsoid from the unknowns of a fit, in batches, with exact derivatives.
+# Magnitudes of a torque-free ellipsoid from the unknowns of a fit, in batches, with exact
+# derivatives.
 
 # Unknowns besides the attitude: logarithms of the second and third semi-axis over the first, of
 # the homogeneous ellipsoid of the same inertia (2) and of the visible shape (2); body rates (3);
-# coefficients of the phase function; offsets. A step turns the attitude by a rotation vector (3).
+# coefficients of the phase function; offsets. A step rotates the attitude by a rotation vector (3).
 INERTIA, SHAPE, RATES, PHASE = slice(0, 2), slice(2, 4), slice(4, 7), 7
 
 
@@ -382,14 +385,14 @@ class Points(NamedTuple):
     sun: Triple
     observer: Triple
     alpha: Float[Array, "1 n"]
-    sphere: Float[Array, "1 n"]  # magnitude that the law itself gives a sphere
+    sphere: Float[Array, "1 n"]  # magnitude of a sphere by the scattering law alone
     magnitude: Float[Array, "1 n"]
-    weight: Float[Array, "1 n"]  # 1 / sigma^2; 0 pads
+    weight: Float[Array, "1 n"]  # 1 / sigma^2; 0 for padding
     columns: Float[Array, "c n"]  # of the offsets
-    stiffness: Float[Array, " c"]  # 1 / sigma^2 of what is known of them
+    stiffness: Float[Array, " c"]  # 1 / sigma^2 of the offsets' priors
 
     def without_offsets(self) -> "Points":
-        """For programs that take long to compile: one serves every number of offsets."""
+        """Without columns: one compiled program then serves every number of offsets."""
         none = jnp.zeros((0, self.t.shape[-1]), self.t.dtype)
         return self._replace(columns=none, stiffness=none[:, 0])
 
@@ -408,7 +411,7 @@ def moments_of(unknowns: Float[Array, "*b u"]) -> Triple:
 
 
 def attitudes(unknowns: Float[Array, "b u"], wxyz: Float[Array, "b 4"], t: Float[Array, "1 n"]):
-    """Quaternion components (b, n) of the exact motion."""
+    """Quaternion components (b, n) of the torque-free motion at times ``t``."""
     omega = tuple(unknowns[:, k] for k in (4, 5, 6))
     start = tuple(wxyz[:, k] for k in range(4))
     return free_motion(moments_of(unknowns), start, omega, t, rates=False)[1]
@@ -424,20 +427,21 @@ def _to_body(q, vector: Triple) -> Triple:
 def _sample_magnitudes(
     phase: AbstractPhase, q, turn: Triple, shape, coefficients, points: Points
 ) -> Scalars:
-    """Magnitudes but for offsets; all arguments by sample. ``turn``: small, of space."""
+    """Magnitudes without offsets. All arguments are per sample; ``turn``: a small rotation vector
+    in space, which is zero and only carries derivatives."""
     sun, observer = (
         tuple(a - b for a, b in zip(v, _cross(turn, v), strict=True))
         for v in (points.sun, points.observer)
     )
     b, c = jnp.exp(shape[0]), jnp.exp(shape[1])
     light = seeliger_ellipsoid((jnp.ones_like(b), b, c), _to_body(q, sun), _to_body(q, observer))
-    # over the sphere of the same volume
+    # relative to the sphere of the same volume
     light = jnp.maximum(light, 1e-12) / (jnp.pi / 2 * (b * c) ** (2 / 3))
     return -2.5 * jnp.log10(light) - points.sphere + phase.magnitudes(points.alpha, coefficients)
 
 
 def magnitudes(phase: AbstractPhase, bodies: Bodies, points: Points) -> Float[Array, "b n"]:
-    """Reduced magnitudes, but for the offsets."""
+    """Reduced magnitudes, without the offsets."""
     q = attitudes(*bodies, points.t)
     u, zero = bodies.unknowns[:, :, None], jnp.zeros(())
     many = len(phase.typical)
@@ -448,9 +452,9 @@ def magnitudes(phase: AbstractPhase, bodies: Bodies, points: Points) -> Float[Ar
 
 
 def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Points):
-    """Magnitudes (b, n) and their derivatives (b, 10 + c, n), the turn in space (3) last.
+    """Magnitudes (b, n) and their derivatives (b, 10 + c, n), by the rotation vector (3) last.
 
-    Forward derivatives of the motion by five unknowns, reverse derivatives of the light by sample.
+    Forward mode through the motion for its five unknowns, reverse mode through the light.
     """
     u, wxyz = bodies
     count = u.shape[0]
@@ -478,7 +482,8 @@ def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Poi
     # the light.
     value, pull = jax.vjp(brightness_of, q, turn, shape, coefficients)
     by_q, by_turn, by_shape, by_coefficients = pull(jnp.ones(whole, u.dtype))
-    # one tangent at a time, by a loop: one copy in the program, and samples stay side by side
+    # One tangent at a time in a loop: the program contains the motion once, and the samples remain
+    # contiguous.
     turned = jax.lax.map(along, jnp.eye(5, dtype=u.dtype))
     motion = cast(Array, sum(a[None] * b for a, b in zip(by_q, turned, strict=True)))
     by_phase_function = [by_coefficients[..., k] for k in range(many)]
@@ -488,7 +493,7 @@ def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Poi
 
 
 def _frequencies(unknowns):
-    """Logarithms of f_phi and f_psi, and the mode, of one body."""
+    """Logarithms of f_phi and f_psi (2,), and the mode of one body."""
     periods = principal_periods(moments_of(unknowns), unknowns[RATES])
     return -jnp.log(jnp.stack([periods.P_phi, periods.P_psi])), periods.mode
 
@@ -498,11 +503,11 @@ def _with_corrected_rates(old, step):
 
     The frequencies of the result are those of ``old`` plus their derivative along ``step``.
     """
-    # The data fix the frequencies to 1/span, and the frequencies are nonlinear in the rates: a
-    # plain step leaves the narrow, curved valley of good fits, and only very short steps would stay
-    # in it. Two Newton corrections of the rates, each the solution of smallest norm of two
-    # equations in three unknowns, return to the valley at the cost of a few evaluations of the
-    # periods, without the light curve.
+    # The data determine the frequencies to a fraction of 1/span, and these are nonlinear in the
+    # rates: an uncorrected step leaves the narrow, curved valley of good fits unless it is very
+    # short. Two Newton corrections of the rates, each the minimum-norm solution of two equations in
+    # three unknowns, return to the valley. They cost a few evaluations of the periods, none of the
+    # light curve.
     (before, mode), (change, _) = jax.jvp(_frequencies, (old,), (step,))
     plain = old + step
 
@@ -528,10 +533,10 @@ def _with_corrected_rates(old, step):
 
 
 def apply_step(bodies: Bodies, step: Float[Array, "b u+3"]) -> Bodies:
-    """The bodies after a step of the unknowns and a turn in space.
+    """The bodies after a step of the unknowns and a rotation in space (last three components).
 
-    Rates are corrected to second order, so that the frequencies change linearly with the step: the
-    valleys of long light curves are narrow in the frequencies and curved in the rates.
+    The rates are corrected so that the frequencies change linearly with the step: the cost of a
+    long light curve has valleys that are narrow in the frequencies and curved in the rates.
     """
     turn = rotation.rotation_vector_to_wxyz(step[:, -3:])
     wxyz = rotation.normalise(rotation.multiply(turn, bodies.wxyz))

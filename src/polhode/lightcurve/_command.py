@@ -1,4 +1,4 @@
-"""What ``polhode lightcurve FILE`` does: reads, fits, and writes tables, JSON and a figure."""
+"""``polhode lightcurve FILE``: reading and fitting, and output of tables, JSON and a figure."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ from polhode.lightcurve._frequencies import (
 )
 from polhode.lightcurve._solutions import COVARIANCE_OF, LightCurveFit, Solution
 
-# of the JSON file; other numbers have none
+# Units of the numbers in the JSON file; those not listed are dimensionless.
 _UNITS = {
     "P_phi": "day",
     "P_psi": "day",
@@ -51,7 +51,7 @@ _UNITS = {
     "covariance": "products of the units of covariance_of; moments and momentum have none",
 }
 
-# Phase functions by the name that the command line gives them.
+# Phase functions by their names on the command line.
 PHASES: dict[str, AbstractPhase] = {
     "seeliger": SeeligerPhase(),
     "linear": LinearPhase(),
@@ -61,19 +61,19 @@ PHASES: dict[str, AbstractPhase] = {
 
 
 def table(fit: LightCurveFit) -> str:
-    """Verdict, null hypotheses and their evidence, the bodies one a line, and notes."""
+    """Null hypotheses with their evidence, the bodies, one per line, the verdict and notes."""
     return "\n".join([model_table(fit), "", solution_table(fit), "", *conclusions(fit)])
 
 
 def conclusions(fit: LightCurveFit) -> list[str]:
-    """Lines that say what may be claimed, why, and what the light curve cannot show."""
+    """Lines with the verdict, its reasons, and notes on what the light curve cannot determine."""
     lines = [f"verdict: {fit.verdict.name} (PAR {fit.par:+d})"]
     lines += [f"because: {reason}" for reason in fit.reasons]
     return [*lines, *(f"note: {note}" for note in fit.notes)]
 
 
 def model_table(fit: LightCurveFit) -> str:
-    """Models of the light curve, null hypotheses first, and their evidence over noise alone."""
+    """Models of the light curve, null hypotheses first; ln Z is relative to noise alone."""
     unit, per = _unit([p for model in fit.models for p in model.periods])
     lines = [f"  ln Z      parameters  rms [mag]  rms/error  model: periods [{unit}]"]
     for model in fit.models:
@@ -87,7 +87,7 @@ def model_table(fit: LightCurveFit) -> str:
 
 
 def solution_table(fit: LightCurveFit) -> str:
-    """The tumbling bodies, one a line, and the main lines of the best."""
+    """The tumbling bodies, one per line, and the main spectral lines of the best."""
     best = fit.best
     unit, per = _unit([best.P_phi, best.P_psi])
     lines = [
@@ -110,7 +110,7 @@ def solution_table(fit: LightCurveFit) -> str:
 
 
 def _unit(periods) -> tuple[str, float]:
-    """A unit in which the periods [day] are neither long nor short, and its number in a day."""
+    """A unit that suits the periods [day]: its name, and how many of it make a day."""
     typical = float(np.exp(np.mean(np.log(periods)))) if len(periods) else 1.0
     if typical > 2:
         return "d", 1.0
@@ -118,7 +118,10 @@ def _unit(periods) -> tuple[str, float]:
 
 
 def frequency_table(pairs: Pairs, count: int = 6, *, lines: bool = False) -> str:
-    """Candidate pairs of frequencies, and what each would mean; ``lines``: of two of their sums."""
+    """Candidate pairs of frequencies and their interpretations.
+
+    ``lines``: the pairs are spectral lines, sums of the frequencies that are not identified.
+    """
     if lines:
         text = ["  explained  line 1 [1/d]  line 2 [1/d]"]
         for a, b, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained))[:count]:
@@ -155,7 +158,7 @@ def run(
     ``phase``: ``"seeliger"``, ``"linear"``, ``"hg"`` or ``"hg1g2"``; ``start``: the JSON file of an
     earlier fit, whose solutions are tried first.
     Without directions to Sun and observer only the frequencies are listed, and None is returned.
-    Raises what `read_light_curve` raises, and ValueError for a floor of 0 where errors are missing.
+    Raises the errors of `read_light_curve`, and ValueError for a floor of 0 without errors.
     """
     path = Path(path)
     name = Path(path.stem if output is None else output)
@@ -193,7 +196,7 @@ def read(
     calibrated: bool = False,
     reduced: bool = False,
 ) -> LightCurve:
-    """The light curve of a file; ValueError where neither it nor the floor gives an error."""
+    """The light curve of a file; ValueError for points without error if ``floor`` is 0."""
     curve = read_light_curve(path, vectors, calibrated=calibrated, reduced=reduced)
     if not floor > 0 and curve.sun is not None and not np.all(curve.sigma > 0):
         raise ValueError(
@@ -220,28 +223,29 @@ def fit_file(
     progress: Callable[[str], None] | None = None,
     reading: dict[str, Any] | None = None,
 ) -> LightCurveFit | None:
-    """Fit, say the table, and write the figure and the numbers; see `run`.
+    """Fit, print the table with ``say``, and write the figure and the JSON file; see `run`.
 
-    ``reading``: how the light curve was read, for the settings in the JSON file.
+    ``reading``: the options with which the light curve was read, for the JSON file.
     """
     curve.require_points()
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
         check_max_frequency(curve.t, max_frequency)
         columns = curve.columns(np.inf)[0]
-        given = {"columns": columns, "max_frequency": max_frequency}
+        options = {"columns": columns, "max_frequency": max_frequency}
         lines = reaches_beyond_pairs(curve.t, max_frequency)
         if not lines:
-            pairs = fourier_pairs(curve.t, curve.magnitude, **given)
+            pairs = fourier_pairs(curve.t, curve.magnitude, **options)
             lines = pairs.is_cut
-        if lines:  # the square of the grid is too small: pairs of lines reach further
-            pairs = fourier_lattices(curve.t, curve.magnitude, **given)
+        if lines:  # beyond the two-dimensional grid: pairs of lines reach higher frequencies
+            pairs = fourier_lattices(curve.t, curve.magnitude, **options)
         say(frequency_table(pairs, lines=lines))
         missing = "without vectors to Sun and observer no body can be fitted."
         for note in (*curve.notes, *pairs.warnings(), missing):
             say(f"note: {note}")
         return None
-    imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
+    # raises ImportError before the search instead of after it
+    imported("the figure of a light curve", "matplotlib", extra="plot")
     settings = {
         "trials": trials,
         "max_frequency": max_frequency,
@@ -267,9 +271,9 @@ def fit_file(
 
 
 def read_solutions(path: str | PathLike[str]) -> tuple[Solution, ...]:
-    """Solutions of an earlier fit from its JSON file, to start another one from.
+    """Solutions of an earlier fit from its JSON file, as ``start`` of another fit.
 
-    Raises FileNotFoundError, and ValueError for a file that is not one of `run`.
+    Raises FileNotFoundError, and ValueError for a file that `run` did not write.
     """
     path = Path(path)
     try:
@@ -348,13 +352,13 @@ def _write(
     say(f"wrote {picture} and {document}")
 
 
-# The figure. The names of `polhode.plot` are imported where it is drawn: they need matplotlib.
+# The figure. `polhode.plot` is imported in the functions, because it needs matplotlib.
 
 
 def figure(fit: LightCurveFit, *, number: int = 0, title: str = "") -> Any:
-    """Figure of a ``LightCurveFit``; solution ``number`` is drawn over the data. Returns it.
+    """Returns a figure of a ``LightCurveFit``, with solution ``number`` drawn over the data.
 
-    Magnitudes without the offsets fitted; gaps longer than a tenth of the light curve are cut out.
+    The fitted offsets are subtracted; gaps longer than a tenth of the light curve are cut out.
     """
     from polhode.plot._samples import styled
 

@@ -1,4 +1,4 @@
-"""Bodies with a convex shape: solutions of ellipsoids refined, and a body of one rotation axis."""
+"""Bodies with a convex shape: refined ellipsoid solutions, and rotators about a fixed axis."""
 
 from typing import NamedTuple
 
@@ -36,41 +36,43 @@ from polhode.lightcurve._solutions import (
 
 # The surface density is that of an ellipsoid times spherical harmonics. An ellipsoid fitted to a
 # body of another shape biases the periods by several of its own standard errors and leaves
-# correlated residuals. With a free convex shape both are those of the noise.
+# correlated residuals. With a free convex shape errors and residuals are at the level of the noise.
 
 DEGREE = 6
-HARMONICS = (DEGREE + 1) ** 2 - 1  # a constant factor is an offset
+HARMONICS = (DEGREE + 1) ** 2 - 1  # without l = 0: a constant factor is an offset of the magnitudes
 _FACETS = 800
-# Standard deviations known before: of each coefficient, of the sum of areas times normals over the
-# area, and of the logarithms of the axes of the inertia about those of the ellipsoid fitted.
+# Standard deviations of the priors: of each coefficient, of the sum of areas times normals over the
+# area, and of the logarithms of the axes of the inertia about those of the fitted ellipsoid.
 _HARMONIC_SIGMA, _CLOSED_SIGMA, _INERTIA_SIGMA = 0.3, 0.02, 0.25
-_STEPS, _ENDING = 25, 1e-3
-_MOTION = np.array([0, 1, 4, 5, 6])  # unknowns of a body that are no shape or phase function
+_STEPS, _ENDING = 25, 1e-3  # maximum number of steps, and the decrease of the cost that ends them
+_MOTION = np.array([0, 1, 4, 5, 6])  # unknowns of the motion: inertia (2) and rates (3)
 
 
 class Refined(NamedTuple):
     """A body with a convex shape."""
 
-    body: Bodies  # one, (1, ...)
+    body: Bodies  # a single body, (1, ...)
     coefficients: np.ndarray  # (k,) of the harmonics, l from 1 on
-    chi2: float  # of the points, by their own errors, robust
-    cost: float  # with the priors
-    covariance: np.ndarray  # (8, 8) of inertia, rates and turn, for unit errors
-    values: np.ndarray  # residuals (n,) [mag], model less data
-    parameters: float  # that the points determine
+    chi2: float  # robust, of the points, by their own errors
+    cost: float  # chi2 and the priors
+    covariance: np.ndarray  # (8, 8) of inertia, rates and rotation vector, for unit errors
+    values: np.ndarray  # residuals (n,) [mag], model minus data
+    parameters: float  # effective number of parameters that the points determine
     linearised: Linearised
 
 
 @jax.jit
 def _light(body: Bodies, coefficients, points: Points, surface):
-    """Magnitudes (n,) of the law, derivatives (n, 8) and (n, k), and the open area (3,), (3, k)."""
+    """Magnitudes (n,) of the Lommel-Seeliger law, and their derivatives by motion (n, 8) and
+    coefficients (n, k); the sum of areas times normals over the area (3,), its derivatives (3, k).
+    """
     normals, density, rows = surface
     u, wxyz = body
     areas = density * jnp.exp(coefficients @ rows)
 
     def attitude_after(step):
         q = attitudes(u.at[:, jnp.asarray(_MOTION)].add(step), wxyz, points.t)
-        assert q is not None  # the attitude was not declined
+        assert q is not None  # for the type checker: attitudes are requested
         return tuple(x[0] for x in q)
 
     q, along = jax.linearize(attitude_after, jnp.zeros(5, u.dtype))
@@ -110,11 +112,11 @@ def refine(
     *,
     rotating: bool = False,
 ) -> Refined:
-    """Least squares of motion, inertia and a convex shape from an ellipsoid's solution.
+    """Least-squares fit of motion, inertia and a convex shape, starting from an ellipsoid.
 
-    ``body``: one, (1, ...). Offsets, and a phase function quadratic in the phase angle besides the
-    body's own, are projected out. Residuals beyond ``limit`` sigma count by their size.
-    ``rotating``: the body keeps rotating about its third axis, and its inertia is left alone.
+    ``body``: a single one, (1, ...). Offsets, and a phase function quadratic in the phase angle in
+    addition to the body's own, are projected out. Residuals beyond ``limit`` sigma count linearly.
+    ``rotating``: the body rotates about its third axis throughout, with a fixed inertia.
     """
     moving = np.isin(np.arange(8), (4, 5, 6, 7)) if rotating else np.full(8, True)
     n, many = linear.t.size, len(phase.typical)
@@ -177,7 +179,9 @@ def refine(
         step *= min(1.0, 0.5 / max(np.abs(np.r_[step[:2], step[5:]]).max(), 1e-30))
         change = np.zeros((1, body.unknowns.shape[1] + 3))
         change[0, _MOTION], change[0, -3:] = step[:5], step[5:8]
-        if rotating:  # the periods, and the correction by them, have no derivatives there
+        # ``stepped`` corrects the rates by derivatives of the periods, which do not exist at a
+        # permanent rotation
+        if rotating:
             turn = rotation.rotation_vector_to_wxyz(jnp.asarray(change[:, -3:]))
             trial = Bodies(
                 body.unknowns + change[:, :-3],
@@ -221,12 +225,12 @@ def _linearised(
     gradient: np.ndarray,
     linear: Linear,
 ) -> Linearised:
-    """With the offsets, and the other columns of ``linear``, as further unknowns."""
+    """The ``Linearised`` model, with the columns of ``linear`` (such as offsets) as unknowns."""
     many, columns = derivatives.shape[1], (linear.columns * linear.root).T
     full = np.zeros((many + columns.shape[1],) * 2)
     full[:many, :many] = prior
     full[many:, many:] = np.diag(linear.stiffness)
-    # The offsets are those of least squares: their priors pull as the residuals do.
+    # The offsets solve the least squares with their priors: both gradients cancel at the solution.
     pull = np.where(linear.stiffness > 0, -residuals @ columns, 0.0)
     return Linearised(residuals, np.hstack([derivatives, columns]), full, np.r_[gradient, pull])
 
@@ -238,9 +242,10 @@ def refined_solutions(
     phase: AbstractPhase,
     limit: float,
 ) -> Described:
-    """The solutions with convex shapes, the best first. ``solutions``: the best first as well.
+    """The solutions refitted with convex shapes, the best first. ``solutions``: the best first.
 
-    Errors of a period hold the spread of the other poles of the same periods, by their odds.
+    The errors of a period include its spread over the other poles with the same periods, weighted
+    by their odds.
     """
     curve = linear.curve
     bodies = [refine(ellipsoid_of(s), linear, points, phase, limit) for s in solutions]
@@ -274,13 +279,13 @@ def refined_solutions(
 def rotating_body(
     linear: Linear, ellipsoid: np.ndarray, points: Points, phase: AbstractPhase, limit: float
 ) -> Refined:
-    """A convex body that rotates about one axis, from an ``ellipsoid`` (6,) of `rotator`."""
+    """A convex body that rotates about one axis, from ``parameters`` (6,) of a `Rotator`."""
     second, third, longitude, latitude, turn, frequency = ellipsoid
     c, s, cb, sb = (f(x) for x in (longitude, latitude) for f in (np.cos, np.sin))
     frame = np.array([[sb * c, sb * s, -cb], [-s, c, 0], [cb * c, cb * s, sb]])
     ca, sa = np.cos(turn), np.sin(turn)
     matrix = np.array([[ca, sa, 0], [-sa, ca, 0], [0, 0, 1]]) @ frame
-    # any inertia for which the third axis is the short one: the rotation is the same
+    # any inertia whose third axis has the largest moment: the rotation does not depend on it
     unknowns = np.r_[np.log([0.8, 0.6]), second, third, 0, 0, 2 * np.pi * frequency, phase.typical]
     wxyz = np.asarray(rotation.matrix_to_wxyz(jnp.asarray(matrix.T)))
     body = Bodies(unknowns[None], wxyz[None])
@@ -329,7 +334,7 @@ def _solution(
 
 
 def _without_copies(solutions: list[Solution], resolution: float) -> list[int]:
-    """Numbers of those that differ in periods, or by 10 degrees in the pole."""
+    """Indices of the solutions that differ in periods, or by 10 degrees in the pole."""
     classes = same_periods(solutions, resolution)
     poles = np.radians([s.pole for s in solutions])
     poles = np.stack(

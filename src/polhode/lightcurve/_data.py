@@ -10,21 +10,20 @@ import numpy as np
 from polhode._checks import ArrayLike
 from polhode.lightcurve._brightness import Points, seeliger_sphere
 
-# A light curve: times, magnitudes, who saw them, and where Sun and observer stood.
-
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 _DOUBLED = math.radians(40)  # phase angle at which the floor has doubled
-_FAR = 1e4  # au, beyond which vectors are not in au
-_ROUNDED = 1e-4  # lengths that differ from 1 by less are those of unit vectors in a few digits
-# Magnitudes beyond this are none: the Sun has -27, the faintest stars seen 32.
+_FAR = 1e4  # longest vector that is plausible in au
+_ROUNDED = 1e-4  # unit vectors written with few digits differ from length 1 by less
+# Larger values are not magnitudes: the Sun has -27, the faintest stars observed 32.
 _FAINTEST = 45.0
-# Deviation of the distance from Sun to observer from 1 au that an observer near the Earth has [au].
+# Tolerance [au] about 1 au of the distance between the Sun and an observer near the Earth.
 _ORBIT = 0.03
-# Points of one night at its brightest magnitude that count as saturated, at least.
+# Least number of points of a night at its brightest magnitude that suggests saturation.
 _REPEATED = 4
-# Points that a light curve has at least.
+# Least number of points of a light curve.
 FEWEST_POINTS = 8
-# Points of one program: light curves are padded to multiples, and a search looks at so many.
+# Points per call of a compiled program: light curves are padded to multiples of it, and a search
+# uses this many points.
 BLOCK = 160
 
 
@@ -38,13 +37,13 @@ class LightCurve(NamedTuple):
 
     t: np.ndarray  # (n,)
     magnitude: np.ndarray  # (n,)
-    sigma: np.ndarray  # (n,), 0 where not given
+    sigma: np.ndarray  # (n,) [mag], 0 where unknown
     group: np.ndarray  # (n,) number of the night or observer
     names: tuple[str, ...]  # of the groups
     sun: np.ndarray | None  # (n, 3)
     observer: np.ndarray | None  # (n, 3)
-    calibrated: bool  # magnitudes of different groups may be compared
-    notes: tuple[str, ...] = ()  # what a reader had to assume
+    calibrated: bool  # whether the groups share a zero point, but for small errors
+    notes: tuple[str, ...] = ()  # assumptions made when the data were read
 
     def __str__(self) -> str:
         sigma = np.median(self.sigma)
@@ -70,14 +69,14 @@ class LightCurve(NamedTuple):
         reduced: bool = False,
         notes: Sequence[str] = (),
     ) -> "LightCurve":
-        """Check and reduce observations.
+        """A light curve from observations, corrected for light time and reduced to 1 au.
 
         ``t`` (n,) [day]; ``magnitude`` (n,); ``sun``, ``observer`` (n, 3): vectors from the body
-        [au], or unit vectors where distances are unknown or already taken off (``at_body``: light
-        time, ``reduced``: 5 log10(r Delta)). ``sigma``: standard deviations, 0 or NaN: unknown.
-        ``group`` (n,): names of nights or observers. ``calibrated``: groups share a zero point
-        but for small errors. Raises ValueError for shapes that differ, values not finite, negative
-        ``sigma``, and times that are all the same.
+        [au], or unit vectors if the distances are unknown. ``at_body``: times are already corrected
+        for light time; ``reduced``: 5 log10(r Delta) is already subtracted. ``sigma``: standard
+        deviations [mag], 0 or NaN: unknown. ``group`` (n,): names of nights or observers.
+        ``calibrated``: groups share a zero point but for small errors. Raises ValueError for shapes
+        that differ, values not finite, negative ``sigma``, and times that are all the same.
         """
         t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
         if t.ndim != 1 or t.shape != magnitude.shape or t.size < FEWEST_POINTS:
@@ -151,11 +150,11 @@ class LightCurve(NamedTuple):
         )
 
     def binned(self, width: float) -> "LightCurve":
-        """Means of the points of one group within ``width`` days: normal points.
+        """Normal points: means of the points of one group within ``width`` days.
 
-        Errors given are combined, and a mean that holds a point of unknown error has none; many
-        noisy points cost no more than few good ones. ``width`` should be below a twentieth of the
-        shortest period sought.
+        Known errors are combined; the error of a mean with a point of unknown error is unknown.
+        Fits of many noisy points become as fast as those of few. ``width`` should be below a
+        twentieth of the shortest period of interest.
         """
         if not width > 0:
             raise ValueError(f"width must be a positive number of days, got {width}.")
@@ -188,8 +187,9 @@ class LightCurve(NamedTuple):
     def scatter(self) -> float:
         """Noise of the points [mag], from their scatter about straight lines between neighbours.
 
-        Of points of one group, less than a twentieth of the light curve and half a day apart: an
-        upper bound where the brightness bends between them. NaN where there are fewer than four.
+        Three neighbours must be of one group and within a twentieth of the light curve and half a
+        day. An upper bound where the brightness is curved between them. NaN with fewer than four
+        such triples.
         """
         t, m = self.t, self.magnitude
         together = (self.group[2:] == self.group[:-2]) & (self.group[1:-1] == self.group[:-2])
@@ -203,7 +203,7 @@ class LightCurve(NamedTuple):
         return float(1.4826 * np.median(np.abs(rest)))
 
     def with_errors(self, default: float) -> "LightCurve":
-        """Points without an error get the scatter of neighbours, or ``default`` [mag]."""
+        """With the scatter of neighbours, or ``default`` [mag], for errors that are unknown."""
         missing = ~(self.sigma > 0)
         if not missing.any():
             return self
@@ -218,7 +218,7 @@ class LightCurve(NamedTuple):
         return self._replace(sigma=sigma, notes=(*self.notes, text))
 
     def require_points(self) -> None:
-        """ValueError for fewer points than a light curve has at least."""
+        """ValueError for fewer than ``FEWEST_POINTS`` points."""
         if self.t.size < FEWEST_POINTS:
             raise ValueError(
                 f"a light curve needs at least {FEWEST_POINTS} points, this one has {self.t.size}:"
@@ -241,10 +241,10 @@ class LightCurve(NamedTuple):
         return self.sun, self.observer
 
     def columns(self, offset_sigma: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets as columns (c, n) and 1 / sigma^2 of each (c,).
+        """Columns (c, n) of the offsets in a linear model, and the precisions of their priors (c,).
 
-        One constant, and a deviation of each group with standard deviation ``offset_sigma``
-        (default: 0.2 mag when calibrated, free otherwise).
+        One constant, and a deviation of each group with standard deviation ``offset_sigma`` [mag]
+        (default: 0.2 if calibrated, else infinite: one free offset for each group).
         """
         if offset_sigma is None:
             offset_sigma = 0.2 if self.calibrated else math.inf
@@ -262,9 +262,9 @@ class LightCurve(NamedTuple):
     def points(self, floor: float, offset_sigma: float | None = None) -> Points:
         """Arrays for the model; ``floor`` [mag] is added to the errors in quadrature.
 
-        It grows by 1 + (phase angle / 40 deg)^2: so does, within a factor of two, the misfit of the
-        best ellipsoid to convex bodies that are none, from 2 to 120 degrees. Without it the few
-        points of a flyby at 90 degrees and more decide against all others.
+        It is multiplied by 1 + (phase angle / 40 deg)^2. From 2 to 120 degrees the misfit of the
+        best ellipsoid to other convex bodies grows like this within a factor of two. Without the
+        factor the few points of a flyby at 90 degrees and more would outweigh all others.
         """
         sun, observer = self._known_directions()
         n, (columns, stiffness) = self.t.size, self.columns(offset_sigma)
@@ -292,7 +292,7 @@ class LightCurve(NamedTuple):
 
 
 def has_distances(lengths: np.ndarray) -> bool:
-    """Whether vectors of these lengths hold distances, and are no unit vectors."""
+    """Whether vectors of these lengths state distances, in contrast to unit vectors."""
     return bool(np.abs(lengths - 1).max() > _ROUNDED)
 
 
@@ -312,7 +312,7 @@ def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def _distance_notes(sun: np.ndarray, observer: np.ndarray) -> list[str]:
-    """A note where Sun and observer, (n, 3) [au] from the body, are not one au apart."""
+    """A note if Sun and observer, (n, 3) [au] from the body, are not about 1 au apart."""
     apart = np.linalg.norm(sun - observer, axis=1)
     if np.abs(apart - 1).max() < _ORBIT:
         return []
@@ -334,7 +334,7 @@ def _photometry_notes(magnitude: np.ndarray, group: np.ndarray, names: np.ndarra
     flat = []
     for k, name in enumerate(names):
         values, counts = np.unique(magnitude[group == k], return_counts=True)
-        # rounded magnitudes repeat all their values, a saturated star only the brightest
+        # rounded magnitudes repeat all values, a saturated detector only the brightest
         many = max(_REPEATED, 0.1 * counts.sum())
         if len(values) > 1 and counts[0] >= max(many, 5 * counts[1]):
             flat.append(str(name))

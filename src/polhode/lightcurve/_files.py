@@ -1,4 +1,4 @@
-"""Files: light curves in CSV, ALCDEF and DAMIT's format, and solutions as those of DAMIT."""
+"""Files: reading light curves in CSV, ALCDEF and DAMIT format, and writing solutions for DAMIT."""
 
 import csv
 from os import PathLike
@@ -35,16 +35,16 @@ def read_light_curve(
     CSV: columns ``jd`` (or ``time``, ``t``; days), ``magnitude`` (``mag``) or ``flux``
     (``brightness``), ``sun_x`` ... ``observer_z`` (``earth_x``; from the body, au), and optionally
     ``sigma`` (``mag_err``, ``err``, ``uncertainty``, ...; in the unit of the brightness),
-    ``group`` (``observer``, ``night``, ``block``); ``notes`` names columns that are not read. Times
-    are those at the observer, not corrected for light time (of a column ``bjd`` or ``hjd`` those at
-    the Sun), and brightness is not reduced for distance, except a flux of mean 1. ``vectors``: a
-    second CSV of ``jd`` and the six components, interpolated linearly, for a file that has none.
-    ALCDEF: magnitudes with their geometry from PHASE, PABL and PABB; sessions whose LTCAPP or
-    REDUCEDMAGS is not NONE are corrected for light time or reduced already. DAMIT: intensities with
-    vectors. Of CSV and ALCDEF: ``calibrated``: groups share a zero point but for small errors;
-    ``reduced``: brightness is reduced for distance already.
+    ``group`` (``observer``, ``night``, ``block``); ``LightCurve.notes`` names columns that are not
+    read. Times are those at the observer, not corrected for light time (in a column ``bjd`` or
+    ``hjd`` those at the Sun), and brightness is not reduced for distance, except a flux of mean 1.
+    ``vectors``: a second CSV of ``jd`` and the six components, interpolated linearly, for a file
+    without them. ALCDEF: magnitudes with their geometry from PHASE, PABL and PABB; sessions whose
+    LTCAPP or REDUCEDMAGS is not NONE are already corrected for light time or reduced. DAMIT:
+    intensities with vectors. For CSV and ALCDEF: ``calibrated``: groups share a zero point but for
+    small errors; ``reduced``: brightness is already reduced for distance.
 
-    Raises FileNotFoundError, and ValueError that names the line or column that is wrong.
+    Raises FileNotFoundError, and ValueError with the line or column that is wrong.
     """
     path = Path(path)
     try:
@@ -71,7 +71,7 @@ def _number(path, line: int, name: str, text: str) -> float:
 
 
 def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
-    """Columns of cells by lower-case name, and the number of each row's line."""
+    """Columns of cells by lower-case name, and the line number of each row."""
     content = [
         (k + 1, s) for k, s in enumerate(lines) if s.strip() and not s.lstrip().startswith("#")
     ]
@@ -126,7 +126,7 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     magnitude = values(("magnitude", "mag"), required=False)
     if magnitude is None:
         flux = values(("magnitude", "mag", "flux", "brightness", "intensity"))
-        assert flux is not None  # it is needed
+        assert flux is not None  # for the type checker: ``values`` raises ValueError
         if not np.all(flux > 0):
             line = numbers[int(np.flatnonzero(~(flux > 0))[0])]
             raise ValueError(f"{path}: line {line}: a flux must be positive.")
@@ -160,9 +160,9 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
 
 
 def _at_observer(t, sun, observer) -> np.ndarray:
-    """Times of observation from barycentric ones, at which the light passed the Sun's distance.
+    """Times of observation from barycentric ones, which refer to the light's passage at the Sun.
 
-    The body's light is taken as that of a star in its direction, which is how such times are made.
+    The light is treated as that of a star in the body's direction, as is usual for such times.
     """
     delta = np.linalg.norm(observer, axis=1)
     if not has_distances(delta):
@@ -199,11 +199,11 @@ def _interpolated(path, t) -> np.ndarray:
             f"{path}: the times of the vectors must increase and cover the light curve,"
             f" {t.min():.5f} to {t.max():.5f}; they are {at[0]:.5f} to {at[-1]:.5f}."
         )
-    # length and direction apart: the chord between two directions is too short
+    # lengths are interpolated separately: the chord between two directions is too short
     between = np.stack([np.interp(t, at, column) for column in six.T], -1).reshape(-1, 2, 3)
     lengths = np.linalg.norm(six.reshape(-1, 2, 3), axis=-1)
-    wanted = np.stack([np.interp(t, at, column) for column in lengths.T], -1)
-    return (between * (wanted / np.linalg.norm(between, axis=-1))[..., None]).reshape(-1, 6)
+    length = np.stack([np.interp(t, at, column) for column in lengths.T], -1)
+    return (between * (length / np.linalg.norm(between, axis=-1))[..., None]).reshape(-1, 6)
 
 
 def _damit(path, lines) -> LightCurve:
@@ -247,7 +247,7 @@ def _damit(path, lines) -> LightCurve:
             f" the {count} light curves and their numbers of points."
         )
     data = np.array(table)
-    # by its documentation: JD corrected for light time, intensity reduced to 1 au
+    # DAMIT's documentation: JD corrected for light time, intensity reduced to 1 au
     return LightCurve.of(
         data[:, 0],
         -2.5 * np.log10(data[:, 1]),
@@ -273,9 +273,9 @@ def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve
             cells = value.split(mark)
             if len(cells) < 2:
                 raise ValueError(f"{path}: line {number} must be DATA=JD|magnitude, got {line!r}.")
-            given = cells[:2] if len(cells) == 2 or not cells[2].strip() else cells[:3]
-            numbers = [_number(path, number, "DATA", c) for c in given]
-            # public files write -9.99 or the like for an unknown error
+            used = cells[:2] if len(cells) == 2 or not cells[2].strip() else cells[:3]
+            numbers = [_number(path, number, "DATA", c) for c in used]
+            # public files contain numbers such as -9.99 for an unknown error
             table.append((*numbers[:2], max((*numbers, 0.0)[2], 0.0)))
             group.append(f"{session:04d}")
             rays.append(tuple(keys.get(k) for k in ("PHASE", "PABL", "PABB")))
@@ -294,7 +294,8 @@ def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve
         six = _interpolated(vectors, data[:, 0])
         sun, observer, notes = six[:, :3], six[:, 3:], []
         r, delta = (np.linalg.norm(v, axis=1) for v in (sun, observer))
-        if has_distances(delta):  # taken off again by the light curve
+        # undo corrections of the file, which ``LightCurve.of`` applies to all points
+        if has_distances(delta):
             at_body, is_reduced = np.array(applied).T
             data[:, 0] += np.where(at_body, LIGHT_TIME * delta, 0)
             data[:, 1] += np.where(is_reduced & (not reduced), 5 * np.log10(r * delta), 0)
@@ -329,7 +330,7 @@ def _is_number(text) -> bool:
 
 
 def _ray(longitude, latitude):
-    """From the body: the bisector's published coordinates point to the body."""
+    """Unit vectors from the body. The coordinates of the bisector point to the body: minus."""
     return -np.stack(
         [
             np.cos(latitude) * np.cos(longitude),
@@ -340,7 +341,7 @@ def _ray(longitude, latitude):
     )
 
 
-# Export of a solution as the numbers and the shape file of a tumbler of DAMIT.
+# Export of a solution as the parameters and the shape file of a tumbler in DAMIT.
 
 COLUMNS = ("lambda", "beta", "P_psi", "P_phi", "I1", "I2", "phi0", "psi0", "JD0")
 
@@ -385,9 +386,9 @@ def write_damit(solution: "Solution", folder: str | PathLike[str], *, jd_of_zero
 def axis_order(solution: "Solution") -> np.ndarray:
     """Axes x, y, z of DAMIT as columns (3, 3) in the body axes of the solution, right-handed.
 
-    z is the principal axis about which psi circulates: that of the largest moment in the short-axis
-    mode, of the smallest one in the long-axis mode; its direction is that within 90 degrees of the
-    angular momentum. Of the others x has the smaller moment.
+    z is the principal axis about which psi circulates: the one of the largest moment in the
+    short-axis mode, of the smallest in the long-axis mode; it points to within 90 degrees of the
+    angular momentum. Of the other two, x has the smaller moment.
     """
     momentum = solution.moments * solution.omega_body
     order = np.argsort(solution.moments)
@@ -401,7 +402,7 @@ def axis_order(solution: "Solution") -> np.ndarray:
 
 
 def tumbler_of(solution: "Solution", axes: np.ndarray, jd_of_zero: float) -> dict[str, float]:
-    """The numbers of ``COLUMNS``: degrees, hours and moments over that about z."""
+    """The numbers of ``COLUMNS``: degrees, hours, and moments relative to that about z."""
     matrix = np.asarray(rotation.wxyz_to_matrix(np.asarray(solution.wxyz, float)))
     momentum = matrix @ (solution.moments * solution.omega_body)
     momentum = momentum / np.linalg.norm(momentum)
@@ -460,7 +461,7 @@ def ellipsoid_mesh(axes: np.ndarray, rows: int = 24) -> tuple[np.ndarray, np.nda
 
 
 def _shape(vertices: np.ndarray, faces: np.ndarray) -> str:
-    """Counts, vertices, and the numbers of the vertices of each facet, counted from 1."""
+    """Text of a shape file: counts, vertices, and the vertex numbers (from 1) of each facet."""
     lines = [f"{len(vertices)} {len(faces)}"]
     lines += [" ".join(f"{x:.12g}" for x in vertex) for vertex in vertices]
     lines += [" ".join(str(i + 1) for i in face) for face in faces]

@@ -1,4 +1,4 @@
-"""``fit_light_curve``: all tumbling bodies that explain a light curve, and the verdict on them."""
+"""``fit_light_curve``: all tumbling bodies that explain a light curve, and a verdict."""
 
 from collections.abc import Callable, Sequence
 
@@ -43,21 +43,23 @@ from polhode.lightcurve._solutions import (
 )
 from polhode.lightcurve._verdict import judge, null_models
 
-# The search. Its cost is dominated by light curves of trial bodies, so that most bodies are
-# rejected on few points and by cheap scores: draws by the Fourier series, a part of them by their
-# misfit to `_FEW` points, the rest by a few steps of least squares on these points, with fewer
-# bodies and more steps in each round (`_DESCENT`). Only the best are fitted to all points.
+# The search. Its cost is dominated by light curves of trial bodies. Most bodies are therefore
+# rejected by cheap scores: all draws by the Fourier series, a part of them by their misfit to
+# `_FEW` points, the rest by a few least-squares steps on these points, with fewer bodies and more
+# steps in each round (`_DESCENT`). Only the best are fitted to all points.
 
-_FEW = BLOCK  # points that a search looks at
-_DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
-_LAST = 12  # steps of the better half of what is left
-_WIDE = 10.0  # limit of the first steps' residuals, in sigma
-# pairs of periods searched again: trials of each, in as many parts with frequencies of their own
+_FEW = BLOCK  # points that a search uses
+_DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # rounds: part of the starts, and number of steps
+_LAST = 12  # steps of the better half of the bodies after these rounds
+_WIDE = 10.0  # limit of residuals in the first steps, in sigma
+# Motions searched again with more poles: their number, trials of each, and the number of parts of
+# these trials, each with its own frequencies.
 _AGAIN, _MORE, _PARTS = 8, 2000, 6
-_LIMIT = 3.0  # of residuals in a search, in sigma
-_LEADING, _OFTEN = 512, 3  # as many are tried again, the first so often; the 128th half as often
-_ALIKE = 4  # poles kept of one pair of periods: a motion and its three mirror images
-_GROUPS = 8  # of so many, or more, it is learnt how much their zero points differ
+_LIMIT = 3.0  # limit of residuals in the last steps of a search, in sigma
+# Second round of a search: number of hypotheses, and repeats of the first; the 128th has half.
+_LEADING, _OFTEN = 512, 3
+_ALIKE = 4  # solutions per pair of periods: a motion and its three mirror images
+_GROUPS = 8  # least number of groups from which the spread of their zero points is estimated
 
 
 def fit_light_curve(
@@ -78,30 +80,32 @@ def fit_light_curve(
     start: Sequence[Solution] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> LightCurveFit:
-    """All tumbling ellipsoids, of free inertia, that explain a light curve; no starting guess.
+    """All tumbling bodies that explain a light curve, with a verdict; needs no starting guess.
 
     The search (docs/light_curves.md): pairs of frequencies from Fourier series, each with all its
-    interpretations; ``trials`` bodies with these periods, with phases from the series and other
-    parameters drawn at random; Levenberg-Marquardt, with exact derivatives, on the best ``starts``
-    of each interpretation, then again on the most probable; mirror images; the ``max_solutions``
-    best distinct solutions and all others that cannot be excluded. Repeated until two searches
-    agree and the residuals are those of the errors, at most ``searches`` times.
+    interpretations; ``trials`` ellipsoids of any inertia with these periods, with phases from the
+    series and other parameters drawn at random; Levenberg-Marquardt, with exact derivatives, on the
+    best ``starts`` of each interpretation, then again on the most probable; mirror images; the
+    ``max_solutions`` best distinct solutions and all others that cannot be excluded. The search is
+    repeated until two searches agree and the residuals correspond to the errors, at most
+    ``searches`` times.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series.
     ``max_frequency``: the highest frequency of the search, per day. ``floor`` [mag]: added to the
     errors in quadrature, growing with the phase angle, for what an ellipsoid cannot represent.
-    ``offset_sigma``: see ``LightCurve.columns``; None: of a calibrated curve with eight groups or
-    more it is estimated from the best motion, and all are fitted again with it. ``limit``:
-    residuals beyond as many sigma count by their size, not their square. Needs float64
-    (``jax_enable_x64``). ``start``: solutions of an earlier fit, such as one to fewer nights. They
-    are fitted to this light curve first and count as a search; ``searches=0`` adds no other.
-    ``progress`` is called with a few words on what is done next.
+    ``offset_sigma``: see ``LightCurve.columns``; None: for a calibrated curve with at least eight
+    groups it is estimated from the best motion, and all bodies are fitted again with it. ``limit``:
+    residuals beyond this many sigma count linearly, not by their square. ``convex``: whether convex
+    shapes are fitted; None: if the directions to Sun or observer change by 5 degrees or more.
+    ``start``: solutions of an earlier fit, such as one to fewer nights. They are fitted to this
+    light curve first and count as a search; ``searches=0`` adds no other. ``progress`` is called
+    with a short description of each stage. Needs float64 (``jax_enable_x64``).
 
     Raises RuntimeError in float32, ValueError for a light curve without directions, and for
     ``searches`` below 1, or 0 with ``start``.
     """
-    # JAX adds its settings when it runs, which its types do not tell
+    # JAX defines this attribute at run time; its type stubs lack it
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise RuntimeError(
             "fits of light curves need float64: jax.config.update('jax_enable_x64', True)."
@@ -124,7 +128,7 @@ def fit_light_curve(
         pairs = fourier_lattices(
             curve.t, curve.magnitude, columns=columns, max_frequency=max_frequency
         )
-    if not np.isfinite(pairs.max_frequency):  # of pairs that were given: how many were tried
+    if not np.isfinite(pairs.max_frequency):  # of the caller's pairs: estimates how many were tried
         pairs = pairs._replace(max_frequency=2 * float(max(pairs.f_phi.max(), pairs.f_psi.max())))
     meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
@@ -136,7 +140,7 @@ def fit_light_curve(
         state = problem.start(bodies, np.full(len(bodies.wxyz), _WIDE))
         state = _improve_best(problem, state, pairs.resolution, BATCH, limit, 30)
         state = _with_poles(jax.random.fold_in(key, 2), state, rough, problem, pairs.resolution)
-        # the best of the earlier solutions was found by searches of its own
+        # the earlier fit's own searches found its best solution
         reproduced = searches == 0 and _is_best(start[0], state, pairs.resolution)
     for k in range(searches):
         say(f"search {k + 1} of at most {searches}: {len(meant.f_phi)} pairs of periods")
@@ -146,10 +150,10 @@ def fit_light_curve(
         )
         if state is not None:
             agree = _searches_agree(state, result, pairs.resolution)
-            # a search that misses the best motion of two others does not make it less certain
+            # a motion that two searches found remains reproduced if a third one misses it
             reproduced = agree or (reproduced and state.cost.min() <= result.cost.min())
         state = result if state is None else _concatenate(state, result)
-        # found again, and the errors assumed are reached: nothing is left to be found
+        # reproduced, with residuals that correspond to the errors: no further search is needed
         freedom = max(curve.t.size - state.matrix.shape[1], 1)
         if reproduced and state.cost.min() < REACHED * freedom:
             break
@@ -224,7 +228,7 @@ def fit_light_curve(
 
 
 def _blur(curve: LightCurve) -> float:
-    """How far off the frequencies of a series may be: its grid, and the turn of the directions."""
+    """Uncertainty of the frequencies of a series, by its grid and by the change of directions."""
     sun, observer = curve._known_directions()
     bisector = sun + observer
     bisector = bisector / np.linalg.norm(bisector, axis=1, keepdims=True)
@@ -233,9 +237,9 @@ def _blur(curve: LightCurve) -> float:
 
 
 def _second_round(meant: Hypotheses, least_cost: np.ndarray) -> Hypotheses:
-    """Those to try again, several times over: each time has trials and starts of its own.
+    """Hypotheses for a second round, each repeated several times with its own trials and starts.
 
-    The likeliest, and those whose best body has the ``least_cost`` (h,), in turn.
+    They alternate between the most probable and those with the lowest ``least_cost`` (h,).
     """
     many = len(least_cost)
     place = np.minimum(np.arange(many), np.argsort(np.argsort(least_cost)) + 0.5)
@@ -248,7 +252,7 @@ def _second_round(meant: Hypotheses, least_cost: np.ndarray) -> Hypotheses:
 def _search_once(
     key, meant, trials: int, starts: int, rough: Problem, problem: Problem, blur, resolution
 ) -> State:
-    """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
+    """One search: bodies of all hypotheses, a second round, more poles for the best periods."""
     own = jax.random.split(key, 3)
     state, reached = _descend(own[0], meant, trials, starts, rough, problem, blur)
     likely = _second_round(meant, reached)
@@ -258,7 +262,7 @@ def _search_once(
 
 
 def _with_poles(key, state: State, rough: Problem, problem: Problem, resolution) -> State:
-    """The best, and more of their periods."""
+    """The best bodies, and further ones with the same periods, whose poles may be better."""
     near = _hypotheses_of_best(state, resolution)
     trials = _MORE * len(near.f_phi)
     near = Hypotheses(*(np.repeat(x, _PARTS) for x in near))
@@ -268,16 +272,16 @@ def _with_poles(key, state: State, rough: Problem, problem: Problem, resolution)
 
 
 def _descend(key, meant, trials: int, keep: int, rough: Problem, whole: Problem, blur):
-    """Steps from the ``keep`` best trials of every hypothesis, more from the best of these.
+    """Least-squares steps from the ``keep`` best trials of every hypothesis, more for the best.
 
-    The bodies that were stepped to the end, and the least cost of each hypothesis.
+    Returns the bodies of the last rounds, and the lowest cost of each hypothesis.
     """
     best_drawn = best_trials(
         key, meant, trials, keep, rough.phase, whole.points, rough.points, blur
     )
     count = len(best_drawn.gain)
     bodies = select_padded(best_drawn.bodies, np.arange(count))
-    # the gain, as a first step of the shape
+    # the gain multiplies the light's variations: a first correction of the axes' logarithms
     bodies.unknowns[:count, 2:4] *= best_drawn.gain[:, None]
     source = np.pad(best_drawn.source, (0, len(bodies.wxyz) - count), mode="edge")
     state = rough.start(bodies, np.full(len(bodies.wxyz), _WIDE))
@@ -296,7 +300,7 @@ def _descend(key, meant, trials: int, keep: int, rough: Problem, whole: Problem,
 
 
 def _improve_best(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):
-    """The ``keep`` best distinct ones, improved."""
+    """The ``keep`` best distinct bodies, after ``steps`` of least squares."""
     best = _distinct_solutions(state, resolution, keep)
     best = np.pad(best, (0, keep - len(best)), mode="edge")
     width = np.full(keep, limit)
@@ -304,7 +308,7 @@ def _improve_best(problem: Problem, state: State, resolution, keep: int, limit: 
 
 
 def _hypotheses_of_best(state: State, resolution: float) -> Hypotheses:
-    """Periods and modes of the best bodies."""
+    """The periods and modes of the best bodies, as hypotheses: up to `_AGAIN` distinct ones."""
     f_phi, f_psi, mode = frequencies(state.bodies)
     index: list[int] = []
     for k in np.argsort(state.cost):
@@ -320,7 +324,7 @@ def _hypotheses_of_best(state: State, resolution: float) -> Hypotheses:
 
 
 def _searches_agree(one: State, other: State, resolution: float) -> bool:
-    """Whether the best motion of both is in both, poles apart."""
+    """Whether both states contain the best motion of the two, with any pole."""
     f_phi, f_psi, mode = zip(*(frequencies(s.bodies) for s in (one, other)))
     k = int(np.argmin([s.cost.min() for s in (one, other)]))
     best = int(np.argmin((one, other)[k].cost))
@@ -348,7 +352,7 @@ def _concatenate(*states: State) -> State:
 
 
 def _subsample(points: Points, count: int) -> Points:
-    """``count`` of the points at most, evenly chosen."""
+    """At most ``count`` of the points, evenly spaced in number."""
     places = np.flatnonzero(np.asarray(points.weight[0]) > 0)
     if len(places) <= count:
         return points
@@ -359,9 +363,9 @@ def _subsample(points: Points, count: int) -> Points:
 
 
 def _distinct_solutions(state: State, resolution: float, max_count: int) -> np.ndarray:
-    """Numbers of the ``max_count`` best solutions that differ in mode, frequencies or pole.
+    """Indices of the ``max_count`` best solutions that differ in mode, frequencies or pole.
 
-    Of one mode and frequencies no more than `_ALIKE`, so that others are not crowded out.
+    At most `_ALIKE` have the same mode and frequencies, so that other motions are not crowded out.
     """
     f_phi, f_psi, mode = frequencies(state.bodies)
     pole = momentum(state.bodies)
@@ -384,10 +388,11 @@ def _distinct_solutions(state: State, resolution: float, max_count: int) -> np.n
 
 
 def _mirrors(curve: LightCurve) -> np.ndarray:
-    """Normals (3, 3) of the mirrors that leave the light of an ellipsoid as it is.
+    """Normals (3, 3) of the mirror planes that preserve the light of an ellipsoid.
 
-    The plane of Sun and observer: exactly, while they keep to it. The plane across the bisector of
-    their directions, and the one across both: the better, the smaller the phase angle.
+    The plane of Sun and observer: exactly, while both remain in it. The plane perpendicular to the
+    bisector of their directions, and the one perpendicular to these two planes: approximately, the
+    better, the smaller the phase angle.
     """
     sun, observer = curve._known_directions()
     first = np.linalg.svd(np.vstack([sun, observer]))[2][-1]
@@ -398,7 +403,7 @@ def _mirrors(curve: LightCurve) -> np.ndarray:
 
 
 def _reflect(bodies: Bodies, normal: np.ndarray) -> Bodies:
-    """The motions seen in a mirror that holds Sun and observer, which gives the same light.
+    """The motions reflected in a plane through Sun and observer, which gives the same light.
 
     With M the reflection in space and D that of body axis y, the attitude is M R D, the rates
     -D omega; the ellipsoid and its inertia do not change.

@@ -1,4 +1,4 @@
-"""Fourier series of a light curve, and which frequencies of a body its lines may be."""
+"""Fourier series of a light curve, and the interpretations of its lines as a body's frequencies."""
 
 from functools import partial
 from typing import NamedTuple
@@ -10,21 +10,21 @@ from jaxtyping import Array, Float
 
 from polhode.lightcurve._data import BLOCK
 
-# Two-dimensional Fourier series: which pairs of frequencies a light curve allows.
+# Two-dimensional Fourier series: the pairs of frequencies that fit a light curve.
 #
-# The brightness of a free body, seen from constant directions, is a series in ``cos`` and ``sin``
-# of ``2 pi (i f_phi + j f_psi) t``. If f_phi and f_psi are nodes of a uniform grid, so is every
-# such sum. The transforms of data and sampling window are therefore tabulated once, in O(points x
-# nodes), and the normal equations of any pair are read from the tables: their cost does not depend
-# on the number of points, only on the square of the number of terms.
+# The brightness of a torque-free body, seen from constant directions, is a series in ``cos`` and
+# ``sin`` of ``2 pi (i f_phi + j f_psi) t``. If f_phi and f_psi are nodes of a uniform grid, so is
+# every such sum. The transforms of data and sampling window are therefore tabulated once, in
+# O(points x nodes), and the normal equations of any pair are looked up in the tables: their cost
+# does not depend on the number of points, only on the square of the number of terms.
 
 _CHUNK = 4096
-# Nodes of the grid of frequencies, for pairs over the whole square of it and for lines.
+# Maximum number of frequency nodes, for the two-dimensional grid of pairs and for that of lines.
 _MAX_PAIR_NODES, _MAX_LINE_NODES = 600, 15_000
 _FASTEST = 24.0  # per day: the second harmonic of a rotation in two hours
-_EDGE = 0.95  # of the highest frequency: lines above are at the edge of the grid
-# Sums of a line g and another h, in halves: g and what it may be a harmonic of, or have as one, so
-# that h is not chosen for what g alone explains; h, and its sidebands.
+_EDGE = 0.95  # lines above this part of the highest frequency are at the edge of the grid
+# Sums (i, j) of two lines g and h: g/2, g, 3g/2 and 2g, so that h is not chosen for what g alone
+# explains; then h, g + h and g - h.
 LINES = np.array([(1, 0), (2, 0), (3, 0), (4, 0), (0, 2), (2, 2), (2, -2)]) / 2
 
 
@@ -36,12 +36,12 @@ class Pairs(NamedTuple):
     explained: np.ndarray  # (k,) part of the variance that the series explains
     resolution: float  # 1 / span
     max_frequency: float = np.inf  # end of the grid
-    # strongest line of the whole spectrum, that of the sampling, which may exceed the grid
+    # strongest line of the whole spectrum that the sampling resolves; may be beyond the grid
     strongest: float = np.nan
-    is_cut: bool = False  # the spectrum has strong lines beyond the grid, which was cut
+    is_cut: bool = False  # the grid was limited and the spectrum has strong lines beyond it
 
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on what the range of the search may have missed."""
+        """Sentences on lines that may lie beyond the range of the search."""
         at_edge = max(self.f_phi[:1].max(initial=0), self.f_psi[:1].max(initial=0))
         out = []
         if self.is_cut or self.strongest > self.max_frequency:
@@ -60,17 +60,17 @@ class Pairs(NamedTuple):
 
 
 def terms(order: int, even: bool = True) -> np.ndarray:
-    """Multiples (i, j) of f_phi and f_psi, one of each pair of opposites.
+    """Multiples (i, j) of f_phi and f_psi, one of each pair of opposite signs.
 
-    ``even``: only even j. A body in long-axis mode that half a turn about its long axis does not
-    change, such as an ellipsoid, has no others.
+    ``even``: only even j. The light of a body in long-axis mode that is symmetric under half a turn
+    about its long axis, such as an ellipsoid, has no others.
     """
     j = np.arange(-order, order + 1) * (2 if even else 1)
     grid = np.array([(a, b) for a in range(order + 1) for b in j])
     return grid[(grid[:, 0] > 0) | (grid[:, 1] > 0)]
 
 
-@partial(jax.jit, static_argnums=3)  # one program, not one for each operation
+@partial(jax.jit, static_argnums=3)  # outside jit too, one program for all operations
 def _transforms(t, values, step: float, count: int):
     """Sums of ``values`` (c, n) times exp(-2 pi i k step t), k = 0 ... count - 1: (c, count)."""
 
@@ -94,9 +94,9 @@ def _gram(tables, a, b):
         value = jnp.take(table, jnp.abs(k), axis=-1)
         return jnp.where(k < 0, jnp.conj(value), value)
 
-    # A product of two waves is a wave of the difference plus one of the sum of their frequencies,
-    # both nodes of the grid: two look-ups replace a sum over the points. Blocks cos cos, cos sin,
-    # sin cos, sin sin; of the transforms with exp(-i x), Re is cos and -Im is sin.
+    # A product of two waves is a wave with the difference plus one with the sum of their
+    # frequencies, both nodes of the grid: two look-ups replace a sum over the points. Blocks cos
+    # cos, cos sin, sin cos, sin sin. The transforms use exp(-i x): Re is cos and -Im is sin.
     less, more = at(window, a - b), at(window, a + b)
     cc, ss = (less.real + more.real) / 2, (less.real - more.real) / 2
     sc, cs = -(more.imag + less.imag) / 2, -(more.imag - less.imag) / 2
@@ -135,15 +135,16 @@ class Scan(NamedTuple):
     size: int  # points
     resolution: float
     strongest: float  # frequency of the strongest line
-    is_cut: bool
+    is_cut: bool  # as in ``Pairs``
 
     @classmethod
     def of(
         cls, t, values, columns, highest, oversampling: int, most: int, max_nodes: int | None = None
     ) -> "Scan":
-        """``most``: the highest sum looked at is that many times the highest frequency.
+        """Tables for data ``values`` at times ``t``, with ``columns`` projected out.
 
-        ``highest``: the end of the grid; None: that of the strong lines, at ``max_nodes`` at most.
+        ``most``: the highest sum is that many times the highest frequency. ``highest``: the end of
+        the grid; None: the end of the strong lines, but at most ``max_nodes`` nodes.
         """
         t, values = np.asarray(t, float), np.asarray(values, float)
         t = t - t[0]
@@ -165,7 +166,7 @@ class Scan(NamedTuple):
                 highest = min(end, max_nodes * step)
                 is_cut = end > highest
         count = int(np.ceil(highest / step)) + 1
-        # Points, columns and frequencies are filled up, for programs that serve many light curves.
+        # Points, columns and frequencies are padded, so that one program serves many light curves.
         missing, spare = -t.size % BLOCK, -len(basis) % 8
         rows = np.vstack([np.ones_like(t), values, basis, np.zeros((spare, t.size))])
         transforms = np.asarray(
@@ -173,7 +174,7 @@ class Scan(NamedTuple):
                 jnp.asarray(np.pad(t, (0, missing))),
                 jnp.asarray(np.pad(rows, ((0, 0), (0, missing)))),
                 step,
-                _filled_up(2 * (most * count + 1)),
+                _padded_size(2 * (most * count + 1)),
             )
         )
         window, data, columns = map(jnp.asarray, (transforms[0], transforms[1], transforms[2:]))
@@ -189,20 +190,21 @@ class Scan(NamedTuple):
         )
 
     def pairs(self, f_phi, f_psi, explained) -> Pairs:
-        """Candidates of this grid."""
+        """``Pairs`` with the resolution and range of this grid."""
         end = (self.count - 1) * self.step
         return Pairs(f_phi, f_psi, explained, self.resolution, end, self.strongest, self.is_cut)
 
     def fit_nodes(self, nodes: np.ndarray, soft=1e-3) -> tuple[np.ndarray, np.ndarray]:
         """Part of the variance (k,) explained by waves at nodes (k, m), and ln det of the matrix.
 
-        ``soft`` (..., m): added to the diagonal of the normal equations, over the number of points.
+        ``soft`` (..., m), times the number of points, is added to the diagonal of the normal
+        equations.
         """
-        chunk = min(_CHUNK, _filled_up(len(nodes)))
+        chunk = min(_CHUNK, _padded_size(len(nodes)))
         whole = np.concatenate([nodes, np.repeat(nodes[-1:], -len(nodes) % chunk, 0)])
         power, size = np.empty((2, len(whole)))
-        # Two sums of a pair may share a node, or be zero: the ridge keeps the matrix regular. With
-        # ``soft`` from prior variances the determinant gives the evidence at no further cost.
+        # Two sums of a pair may share a node, or be zero: the ridge makes the matrix regular. With
+        # ``soft`` from prior variances the determinant gives the evidence at no extra cost.
         ridge = self.size * np.diag(np.tile(np.broadcast_to(soft, nodes.shape[1:]), 2))
         for start in range(0, len(whole), chunk):
             part = slice(start, start + chunk)
@@ -218,7 +220,7 @@ class Scan(NamedTuple):
 
 
 def check_max_frequency(t: np.ndarray, max_frequency: float | None) -> None:
-    """ValueError for a search that ends below one turn within the times."""
+    """ValueError for a highest frequency below one cycle within the light curve."""
     least = 1 / float(np.ptp(t))
     if max_frequency is not None and not max_frequency > least:
         raise ValueError(
@@ -228,7 +230,7 @@ def check_max_frequency(t: np.ndarray, max_frequency: float | None) -> None:
 
 
 def reaches_beyond_pairs(t: np.ndarray, max_frequency: float | None, oversampling: int = 4) -> bool:
-    """Whether the grid of ``fourier_pairs`` to this frequency would not fit into memory."""
+    """Whether this frequency is beyond the grid of ``fourier_pairs``, which memory limits."""
     nodes = 0.0 if max_frequency is None else max_frequency * np.ptp(t) * oversampling
     return nodes > _MAX_PAIR_NODES
 
@@ -244,20 +246,20 @@ def fourier_pairs(
     oversampling: int = 4,
     keep: int = 40,
 ) -> Pairs:
-    """Pairs (f_phi, f_psi) whose Fourier series explain ``values`` best, over a whole grid.
+    """Pairs (f_phi, f_psi) whose Fourier series explain ``values`` best, over a full grid.
 
-    ``columns``: what is fitted besides, such as a constant for each night (default: one
-    constant). ``max_frequency`` of either, per unit of ``t``; default: 1.3 times that of the
-    highest peak of the power spectrum with a tenth of the greatest power, and 2.2 times that of the
-    greatest, but at most 600 steps of the grid, ``600 / oversampling`` turns within the light
-    curve: ``Pairs.is_cut`` and ``Pairs.warnings`` say where that is not enough, and
-    `fourier_lattices` reaches further. Local maxima of the grid, the best ``keep``. Without
-    ``even`` the two may be swapped, and ``f_phi`` is the higher one.
+    ``columns``: functions fitted in addition, such as a constant for each night (default: one
+    constant). ``max_frequency`` of either, per unit of ``t``; default: the larger of 1.3 times the
+    highest frequency with a tenth of the maximum power and 2.2 times that of the maximum, but at
+    most 600 steps of the grid, ``600 / oversampling`` cycles within the light curve:
+    ``Pairs.is_cut`` and ``Pairs.warnings`` state if that is not enough, and `fourier_lattices`
+    reaches higher. Returns the ``keep`` best local maxima on the grid. Without ``even`` the two may
+    be swapped, and ``f_phi`` is the higher one.
     """
     multiples = terms(order, even)
     most = int(np.abs(multiples).sum(1).max())
     scan = Scan.of(t, values, columns, max_frequency, oversampling, most, _MAX_PAIR_NODES)
-    # half a cycle at least; neither frequency may be that of the other
+    # at least half a cycle within the light curve
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 2)
     if not even:
@@ -292,11 +294,11 @@ def fourier_lattices(
     """Pairs of lines (g, h) that explain ``values`` best, given as ``f_phi`` and ``f_psi``.
 
     For long light curves, whose grid has millions of pairs: g is only one of the ``lines`` highest
-    peaks of the spectrum of one frequency, of which aliases are some, and h is sought over the
-    whole grid, beside the multiples of g and half of it. What explains a body's light are a few
-    sums of multiples of its frequencies; which of them g and h are is left open. ``max_frequency``
-    of either, per unit of ``t``; default: as for `fourier_pairs`, but at most 15,000 steps of the
-    grid, ``15_000 / oversampling`` cycles within the light curve.
+    peaks of the spectrum of one frequency (some of which are aliases), and h is searched over the
+    whole grid, in a fit with multiples of g/2. The light of a body has lines at a few sums of
+    multiples of its frequencies; which of these sums g and h are is not decided here.
+    ``max_frequency`` of either, per unit of ``t``; default: as for `fourier_pairs`, but at most
+    15,000 steps of the grid, ``15_000 / oversampling`` cycles within the light curve.
     """
     scan = Scan.of(t, values, columns, max_frequency, oversampling, 2, _MAX_LINE_NODES)
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
@@ -320,13 +322,13 @@ def fourier_lattices(
     return scan.pairs(g, h, power[index])
 
 
-def _filled_up(count: int) -> int:
-    """The next power of two, 256 at least."""
+def _padded_size(count: int) -> int:
+    """The next power of two, at least 256: a padded size that many light curves share."""
     return max(1 << (count - 1).bit_length(), 256)
 
 
 def _maxima(values: np.ndarray) -> np.ndarray:
-    """Numbers of the local maxima, the highest first."""
+    """Indices of the local maxima, the highest first."""
     around = np.pad(values, 1, constant_values=-np.inf)
     high = np.flatnonzero((values >= around[:-2]) & (values >= around[2:]))
     return high[np.argsort(-values[high])]
@@ -341,9 +343,9 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
 def _strong_lines(t, values, step) -> tuple[float, float]:
     """Frequency of the strongest line of the spectrum, and the end of a grid for all strong ones.
 
-    The end: 1.3 times the highest frequency with a tenth of the greatest power, or 2.2 times that
-    of the greatest, whose second harmonic may be the next line. The spectrum reaches to what the
-    sampling resolves; where points are sparse but uneven, to a rotation in two hours.
+    The end: 1.3 times the highest frequency with a tenth of the maximum power, or 2.2 times that of
+    the maximum, whose second harmonic may be the next line. The spectrum extends to the highest
+    frequency that the sampling resolves; for sparse and uneven points to a rotation in two hours.
     """
     gaps = np.diff(np.sort(np.asarray(t, float)))
     gaps = gaps[gaps > 0]
@@ -351,7 +353,7 @@ def _strong_lines(t, values, step) -> tuple[float, float]:
     count = max(int(min(limit / step, 4 * _MAX_LINE_NODES)), 8)
     missing = -len(t) % BLOCK
     t, values = np.pad(np.asarray(t, float), (0, missing)), np.pad(values, (0, missing))
-    (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, _filled_up(count))
+    (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, _padded_size(count))
     power = np.abs(np.asarray(table))[:count] ** 2
     strong = step * np.flatnonzero(power > 0.1 * power.max())[-1]
     strongest = step * int(np.argmax(power))
@@ -360,15 +362,15 @@ def _strong_lines(t, values, step) -> tuple[float, float]:
 
 # Interpretations of pairs of lines of a light curve: periods and mode of a body.
 #
-# Two lines of the spectrum fix the two frequencies once the sums that they stand for are known,
-# which they are not. Every invertible assignment of main sums is solved (a 2 x 2 system each) and
-# ranked by the evidence of the whole series, so that a trial body is never drawn for a pair of
-# frequencies that the spectrum rejects.
+# Two lines of the spectrum determine the two frequencies if it is known which sums they are. It is
+# not: every invertible assignment of main sums is solved (a 2 x 2 system each) and ranked by the
+# evidence of the whole series. No trial body is then drawn for a pair of frequencies that the
+# spectrum rejects.
 
 # Sums i f_phi + j f_psi in the light of ellipsoids, and the part of its variance that each has:
-# means over spins and directions at random, in round numbers. Half a turn about its long axis, or
-# half a period of the nutation about the short one, leave an ellipsoid's light as it was: in
-# long-axis mode j is even, in short-axis mode i + j is.
+# rounded means over random spins and directions. By its symmetry an ellipsoid's light repeats after
+# half a turn about the long axis in long-axis mode (j is even), and after half a period of the
+# nutation with half a turn about the momentum in short-axis mode (i + j is even).
 LAM = {
     (1, 0): 0.4,
     (2, 0): 0.2,
@@ -392,13 +394,13 @@ SAM = {
     (3, 1): 0.003,
     (4, 0): 0.003,
 }
-_MAIN = 0.0101  # sums with more than this are taken for the lines seen
-_OVER = 5  # nodes by resolution
-_LINES = 6  # lines whose other frequency is sought over all of the grid
+_MAIN = 0.0101  # part of the variance above which a sum may be one of the lines
+_OVER = 5  # oversampling: nodes per 1/span
+_LINES = 6  # lines whose second frequency is searched over the whole grid
 
 
 class Hypotheses(NamedTuple):
-    """Periods that a light curve may stand for; arrays (h,)."""
+    """Frequencies and modes of bodies that may explain a light curve; arrays (h,)."""
 
     f_phi: np.ndarray
     f_psi: np.ndarray
@@ -409,15 +411,15 @@ def hypotheses(pairs: Pairs, t, values, *, columns=None, max_count: int = 800) -
     """Frequencies of bodies that explain pairs of lines (g, h), at most ``max_count``, the most
     likely first.
 
-    Each of g and h may be any of the main sums of either mode. For the best pairs g alone may be
-    one, with the other frequency free. A hypothesis is rated by the evidence of Gaussian waves at
-    all sums of its mode, with their usual variances. SAM has
-    ``f_psi <= f_phi``, because no moment exceeds the sum of the other two.
+    Each of g and h may be any of the main sums of either mode. For the best pairs g alone may be a
+    main sum, and the other frequency is free. A hypothesis is rated by the evidence of waves at all
+    sums of its mode with Gaussian amplitudes, whose prior variances are those of ``LAM`` or
+    ``SAM``. In SAM ``f_psi <= f_phi``, because no moment exceeds the sum of the other two.
     """
     lines = np.stack([pairs.f_phi, pairs.f_psi], -1)
     highest = 1.01 * lines.max()
     scan = Scan.of(t, values, columns, highest, _OVER, 8)
-    # noise, waves that are not listed, and directions that turn: twice what the best pair leaves
+    # for noise, waves not listed, and changing directions: twice the misfit of the best pair
     noise = 2 * max(1 - float(np.max(pairs.explained)), 1e-3)
     alone = lines[_separated(lines[:, :1], pairs.explained, 0.2 * pairs.resolution, _LINES), 0]
     candidates, score = [], []
@@ -445,13 +447,13 @@ def hypotheses(pairs: Pairs, t, values, *, columns=None, max_count: int = 800) -
 def _physically_possible(
     meant: np.ndarray, long_axis: bool, resolution: float, highest: float
 ) -> np.ndarray:
-    # half a turn within the light curve at least
+    # at least half a cycle within the light curve
     good = (meant.min(1) >= 0.5 * resolution) & (meant.max(1) <= highest)
     return good if long_axis else good & (meant[:, 1] <= meant[:, 0])
 
 
 def _with_line(i: int, j: int, lines: np.ndarray, scan: Scan) -> np.ndarray:
-    """All (f_phi, f_psi) of the grid for which i f_phi + j f_psi is one of ``lines``."""
+    """All (f_phi, f_psi) on the grid for which i f_phi + j f_psi is one of ``lines``."""
     nodes = scan.step * np.arange(1, scan.count)
     g, other = (x.reshape(-1) for x in np.meshgrid(lines, nodes, indexing="ij"))
     if j == 0:
@@ -460,7 +462,7 @@ def _with_line(i: int, j: int, lines: np.ndarray, scan: Scan) -> np.ndarray:
 
 
 def _evidence(scan: Scan, meant: np.ndarray, sums, misfit: float) -> np.ndarray:
-    """Twice the logarithm of the evidence (k,) of waves of ``sums``, but for a constant."""
+    """Twice the logarithm of the evidence (k,) of waves at ``sums``, up to a constant."""
     nodes = np.rint(meant @ np.array(list(sums)).T / scan.step).astype(int)
     variance = np.array(list(sums.values()))
     power, size = scan.fit_nodes(nodes, misfit / variance / scan.size)
@@ -468,14 +470,14 @@ def _evidence(scan: Scan, meant: np.ndarray, sums, misfit: float) -> np.ndarray:
 
 
 def _inverse_sums(sums) -> np.ndarray:
-    """Matrices (k, 2, 2) from (g, h) to (f_phi, f_psi): two of the sums solved for these."""
+    """Matrices (k, 2, 2) from (g, h) to (f_phi, f_psi), for all pairs of ``sums`` as g and h."""
     main = np.array(list(sums), float)
     pairs = [np.stack([a, b]) for a in main for b in main if abs(np.linalg.det([a, b])) > 0.5]
     return np.unique(np.round(np.linalg.inv(pairs), 9), axis=0)
 
 
 def _separated(points: np.ndarray, score: np.ndarray, size: float, max_count: int) -> list[int]:
-    """Numbers of the ``most`` best of (k, 2), no two within ``size`` of each other."""
+    """Indices of the ``max_count`` best ``points`` (k, d), no two within ``size`` of each other."""
     index: list[int] = []
     for k in np.argsort(-score):
         if not index or np.abs(points[index] - points[k]).max(1).min() > size:
@@ -486,22 +488,22 @@ def _separated(points: np.ndarray, score: np.ndarray, size: float, max_count: in
 
 
 def meaning(f_phi: float, f_psi: float) -> str:
-    """What a pair would mean, in words: modes that it allows, and the strongest sums of each."""
+    """Description of a pair of frequencies: possible modes, and the strongest sums of each."""
 
     def listed(sums):
         return ", ".join(
             f"{sum_name(i, j)} = {i * f_phi + j * f_psi:.5g}" for i, j in list(sums)[:3]
         )
 
-    # A body slower about L than about its long axis can only turn fully about the latter:
-    # (I_s/I_i - 1)(I_s/I_l - 1) <= 1 for moments that mass can have.
+    # A body that precesses about L more slowly than it rotates about its long axis is in long-axis
+    # mode: (I_s/I_i - 1)(I_s/I_l - 1) <= 1 for physical moments.
     if f_psi < f_phi:
         return f"LAM or SAM; LAM: {listed(LAM)}; SAM: {listed(SAM)}"
     return f"LAM only: {listed(LAM)}"
 
 
 def sum_name(i: int, j: int) -> str:
-    """The sum i f_phi + j f_psi in words."""
+    """The sum i f_phi + j f_psi as text."""
     return f"{_name(i, 'f_phi')}{_name(j, 'f_psi', first=i == 0)}"
 
 

@@ -16,10 +16,10 @@ from polhode.lightcurve._brightness import (
 from polhode.lightcurve._data import BLOCK
 
 BATCH = 32
-# What is held of a body before it is seen: logarithms of the axes' ratios 0 +- 0.8; those of the
-# homogeneous ellipsoid of its inertia within 0.25 of its shape's; phase coefficients +- 0.3.
+# Priors of a body: logarithms of the axes' ratios 0 +- 0.8; those of the homogeneous ellipsoid of
+# its inertia within 0.25 of those of its shape; coefficients of the phase function +- 0.3.
 _SHAPE_SIGMA, _TIE_SIGMA, _PHASE_SIGMA = 0.8, 0.25, 0.3
-_EXPECTED = 40  # steps to the spread of offsets; twenty reach three digits
+_EXPECTED = 40  # expectation-maximisation steps of ``spread_of_offsets``; 20 give three digits
 
 
 def _priors(phase: AbstractPhase, columns: int):
@@ -48,7 +48,7 @@ _light_and_derivatives = jax.jit(magnitudes_and_derivatives, static_argnums=0)
 
 
 def blocks_of(points: Points) -> list[Points]:
-    """Of `BLOCK` points each, without offsets: one program of the light serves every number."""
+    """Blocks of `BLOCK` points, without offsets: one program of the light serves any number."""
     plain = points.without_offsets()
     return [
         jax.tree.map(lambda x, k=k: x[..., k : k + BLOCK], plain)
@@ -64,9 +64,10 @@ def light_and_derivatives(phase: AbstractPhase, bodies: Bodies, blocks: list[Poi
 
 @jax.jit
 def robust_equations(value, slopes, offsets, points: Points, limit):
-    """Robust cost (b,), and matrix and right side of the normal equations of data, all unknowns.
+    """Robust cost (b,), and matrix and right side of the normal equations of the data.
 
-    The cost of a residual of r sigma is 2 limit^2 (sqrt(1 + (r / limit)^2) - 1).
+    The cost of a residual of r sigma is 2 limit^2 (sqrt(1 + (r / limit)^2) - 1). Also returns the
+    sum of squares (b,), and magnitudes, robust weights and derivatives by all unknowns.
     """
     rest = value + offsets @ points.columns - points.magnitude
     squared = rest * rest * points.weight / limit[:, None] ** 2
@@ -85,6 +86,8 @@ _apply_step = jax.jit(apply_step)
 
 
 class State(NamedTuple):
+    """A batch of bodies, with cost and normal equations there (priors included)."""
+
     bodies: Bodies
     offsets: np.ndarray
     cost: np.ndarray
@@ -94,7 +97,7 @@ class State(NamedTuple):
 
 
 class Problem:
-    """Damped steps for batches of bodies."""
+    """The least-squares problem of a light curve, for batches of bodies."""
 
     def __init__(self, phase: AbstractPhase, points: Points):
         self.phase, self.points = phase, points
@@ -104,11 +107,11 @@ class Problem:
         self.blocks = blocks_of(points)
 
     def evaluate(self, bodies: Bodies, offsets: np.ndarray, limit: np.ndarray) -> State:
-        """Cost and normal equations of bodies (b,), b a multiple of the batch."""
+        """Cost and normal equations of bodies (b,), b a multiple of ``BATCH``."""
         return self._evaluate(bodies, lambda cut, _: offsets[cut], limit)
 
     def start(self, bodies: Bodies, limit: np.ndarray) -> State:
-        """With the offsets that fit best."""
+        """As ``evaluate``, with the best offsets of each body."""
         c, weight = np.asarray(self.points.columns), np.asarray(self.points.weight)
         solver = np.linalg.inv((c * weight) @ c.T + np.diag(self.stiffness + 1e-9 * weight.sum()))
 
@@ -136,13 +139,13 @@ class Problem:
         return State(bodies, offsets, np.nan_to_num(cost, nan=np.inf), matrix, right, square)
 
     def prior(self, bodies: Bodies, offsets: np.ndarray):
-        """Cost (b,), and matrix (u, u) and right side (b, u), of what is known before."""
+        """Cost (b,), matrix (u, u) and right side (b, u) of the priors."""
         rows, targets, precision = self.priors
         many = bodies.unknowns.shape[1]
         x = np.concatenate([bodies.unknowns, np.zeros((len(offsets), 3)), offsets], axis=1)
         rest = x @ rows.T - targets
-        # Offsets without points are fixed at zero by the stiffness of their padding; free offsets
-        # have stiffness 0, and the jitter of `_solve_damped` alone.
+        # Padding offsets, which no point has, are fixed at zero by a stiffness of 1; free offsets
+        # have stiffness 0, and only the jitter of `_solve_damped` keeps their equations regular.
         soft = np.zeros(x.shape[1])
         soft[many + 3 :] = self.stiffness
         cost = (rest**2 * precision).sum(1) + (x**2 * soft).sum(1)
@@ -153,7 +156,10 @@ class Problem:
         )
 
     def improve(self, state: State, limit: np.ndarray, steps: int, ending: float = 1e-3):
-        """Levenberg-Marquardt; ends when no cost fell by ``ending`` in three steps."""
+        """Levenberg-Marquardt; a body is finished after three steps that gain less than ``ending``.
+
+        The arrays of ``state`` are changed in place.
+        """
         damping = np.full(len(limit), 1e-2)
         idle_steps = np.zeros(len(limit), int)
         for _ in range(steps):
@@ -167,7 +173,7 @@ class Problem:
             old = select(state, active)
             step = -_solve_damped(old.matrix, old.right, damping[active])
             many = step.shape[1] - self.columns
-            # no step of more than half a unit in the logarithms, half a radian in attitude
+            # limits steps to half a unit in the logarithms and half a radian in attitude
             size = np.abs(np.delete(step[:, :many], (4, 5, 6), axis=1)).max(1)
             step *= np.minimum(1, 0.5 / np.maximum(size, 1e-30))[:, None]
             bodies = stepped(old.bodies, step[:, :many])
@@ -187,11 +193,12 @@ class Problem:
 
 
 def spread_of_offsets(matrix, right, offsets, stiffness, groups: slice) -> float:
-    """Standard deviation of the groups' offsets [mag] that makes the points most likely.
+    """Maximum-likelihood standard deviation of the groups' offsets [mag].
 
     ``matrix`` (u, u), ``right`` (u,): normal equations at a body, whose last unknowns are
-    ``offsets`` (c,) held by ``stiffness`` (c,). All unknowns are integrated out of the linear
-    model, by expectation and maximisation: the mean square is that of estimates and variances.
+    ``offsets`` (c,) with prior precisions ``stiffness`` (c,). The unknowns of the linear model are
+    marginalised by expectation-maximisation: the new variance is the mean of squared estimates and
+    their variances.
     """
     index = np.arange(len(matrix) - len(offsets), len(matrix))
     x = np.zeros(len(matrix))
@@ -207,7 +214,7 @@ def spread_of_offsets(matrix, right, offsets, stiffness, groups: slice) -> float
 
 
 def _solve_damped(matrix, right, damping):
-    """Solutions of symmetric systems, scaled to unit diagonal, with ``damping`` on it."""
+    """Solutions of symmetric systems, scaled to unit diagonal, to which ``damping`` is added."""
     diagonal = np.einsum("bii->bi", matrix)
     size = np.sqrt(np.where(diagonal > 0, diagonal, 1))
     damped = matrix / size[:, :, None] / size[:, None]
@@ -219,13 +226,13 @@ def _solve_damped(matrix, right, damping):
 
 
 def select(tree, index):
-    """The bodies of these numbers."""
+    """Elements ``index`` of every array of a tree, such as bodies."""
     return jax.tree.map(lambda x: x[index], tree)
 
 
 def in_parts(function, size: int, bodies: Bodies, *arrays: np.ndarray):
-    """``function`` of bodies (b,) and arrays (b, ...), ``size`` of them at a time: one program
-    serves every number of bodies."""
+    """``function`` of bodies (b,) and arrays (b, ...), in padded parts of ``size``, so that one
+    program serves every number of bodies."""
     total, operands = len(bodies.wxyz), jax.tree.map(np.asarray, (bodies, *arrays))
     index = np.minimum(np.arange(total + -total % size), total - 1).reshape(-1, size)
     parts = [function(*select(operands, part)) for part in index]
@@ -238,6 +245,6 @@ def stepped(bodies: Bodies, step: np.ndarray) -> Bodies:
 
 
 def select_padded(bodies: Bodies, index) -> Bodies:
-    """The same, copied, in whole batches: the last is repeated."""
+    """A copy of the bodies ``index``, padded to whole batches with the last one."""
     index = np.pad(index, (0, -len(index) % BATCH), mode="edge")
     return select(jax.tree.map(np.array, bodies), index)

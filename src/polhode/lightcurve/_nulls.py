@@ -4,9 +4,9 @@ They are compared with tumbling bodies by an approximation of the logarithm of t
 
     ln Z = -N/2 ln(RSS / N) - k/2 ln N - ln M,
 
-N the number of independent points (less the offsets), RSS the sum of squares of the weighted
-residuals, k the parameters, M the independent frequencies that were tried (Schwarz, Ann. Statist. 6
-(1978) 461, with the noise level unknown).
+with N the number of independent points (minus the offsets), RSS the sum of squares of the weighted
+residuals, k the number of parameters and M that of the independent frequencies tried (Schwarz, Ann.
+Statist. 6 (1978) 461, with the noise level unknown).
 """
 
 from typing import NamedTuple
@@ -19,30 +19,31 @@ from polhode.lightcurve._brightness import seeliger_ellipsoid
 from polhode.lightcurve._data import BLOCK, LightCurve
 from polhode.lightcurve._frequencies import LINES, Pairs, Scan, _maxima, terms
 
-_CLIP = 4.0  # residuals beyond as many times the scale of the best model count as that
+_CLIP = 4.0  # residuals are clipped at this multiple of the best model's scale
 _CANDIDATES = 10  # peaks of the spectrum of one period that are refined
-_SCAN_ORDERS, _ORDERS = (2, 4), (1, 2, 3, 4, 6, 8)
+_SCAN_ORDERS, _ORDERS = (2, 4), (1, 2, 3, 4, 6, 8)  # numbers of harmonics
 _MODULATED = 4  # harmonics whose amplitude may change linearly with time
-_BATCH = 32  # rotators improved together
-# poles of rotating ellipsoids of one period that are tried further, and their least distance
+_BATCH = 32  # rotators per call of their compiled program
+# Rotating ellipsoids returned for each frequency, and the least angle between their poles.
 _POLES, _APART = 2, np.radians(20)
-_ROUND = 8  # poles of nearly round bodies of one period from which a convex shape is fitted
-_JOINED = 0.25  # of the inverse span: frequencies of rotating ellipsoids that are one
+_ROUND = 8  # poles, per period, of nearly round bodies from which a convex shape is fitted
+_JOINED = 0.25  # frequencies of rotating ellipsoids that are closer, in 1/span, count as one
 
 
 class Model(NamedTuple):
     """One explanation of a light curve, and its evidence."""
 
     name: str
-    log_evidence: float  # natural logarithm, without a constant that all models share
-    parameters: float  # besides offsets and phase function
+    log_evidence: float  # natural logarithm, up to a constant that all models share
+    parameters: float  # not counting offsets and phase function
     rms: float  # weighted, of the residuals [mag]
     misfit: float  # residuals over the errors of the light curve itself, without any floor
     periods: tuple[float, ...]  # time unit of the light curve [day]
 
 
 class Residuals(NamedTuple):
-    """Residuals (n,) [mag] of a model of so many ``parameters``, from exp(``log_trials``) tried."""
+    """Residuals (n,) [mag] of a model with a number of ``parameters``; exp(``log_trials``):
+    independent frequencies (or pairs) tried."""
 
     name: str
     values: np.ndarray
@@ -63,7 +64,7 @@ class Linear:
             stiffness = np.r_[stiffness, 0.0, 0.0]
         self.columns, self.stiffness = columns, stiffness
         self.root = 1 / curve.sigma
-        # rows of the priors below those of the points
+        # the rows of the priors follow those of the points
         prior = np.diag(np.sqrt(stiffness))[stiffness > 0]
         self.rows = np.vstack([columns.T * self.root[:, None], prior])
         basis, size, _ = np.linalg.svd(self.rows, full_matrices=False)
@@ -72,17 +73,17 @@ class Linear:
 
     @property
     def independent(self) -> int:
-        """Points less the offsets that are free."""
+        """Number of points minus the number of free columns (offsets, phase function)."""
         return max(self.t.size - (self.basis.shape[1] - (len(self.rows) - self.t.size)), 1)
 
     def projected(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, ...) over their errors, with what offsets explain removed."""
+        """Values (n, ...) over the errors, with the columns (such as offsets) projected out."""
         rows = (values.T * self.root).T
         whole = np.concatenate([rows, np.zeros((len(self.rows) - self.t.size, *values.shape[1:]))])
         return whole - self.basis @ (self.basis.T @ whole)
 
     def residuals(self, waves: np.ndarray) -> np.ndarray:
-        """Residuals (n,) [mag] of the data after columns ``waves`` (n, c)."""
+        """Residuals (n,) [mag] of the data after a fit of the columns ``waves`` (n, c)."""
         rest = self.data
         if waves.shape[1]:
             matrix = self.projected(waves)
@@ -90,9 +91,9 @@ class Linear:
         return rest[: self.t.size] / self.root
 
     def offsets(self, residuals: np.ndarray, model) -> np.ndarray:
-        """Offsets that, with the columns beyond, are part of a model with these ``residuals``.
+        """Offsets, and coefficients of the further columns, of a model with these ``residuals``.
 
-        ``model``: a solution with offsets near them, from which they differ by what fits best.
+        ``model``: a solution with nearby offsets, to which the least-squares change is added.
         """
         change = self.curve.magnitude + residuals - model.model
         count = self.offset_count
@@ -103,12 +104,12 @@ class Linear:
         return out
 
     def chi2(self, waves: np.ndarray) -> float:
-        """Sum of squares of the residuals over their errors."""
+        """Sum of squares of the ``residuals`` over the errors."""
         return float(np.sum((self.residuals(waves) * self.root) ** 2))
 
 
 def waves(t: np.ndarray, frequencies: np.ndarray, modulated: int = 0) -> np.ndarray:
-    """Cosines and sines (n, 2 k); the first ``modulated`` ones also times the time."""
+    """Cosines and sines (n, 2 k); those of the first ``modulated`` frequencies also times time."""
     angle = 2 * np.pi * np.outer(t, frequencies)
     both = np.hstack([np.cos(angle), np.sin(angle)])
     if not modulated:
@@ -119,14 +120,14 @@ def waves(t: np.ndarray, frequencies: np.ndarray, modulated: int = 0) -> np.ndar
 
 
 def noise(linear: Linear) -> Residuals:
-    """Offsets and a phase function alone."""
+    """The model of offsets and a phase function alone."""
     return Residuals("noise only", linear.residuals(np.empty((linear.t.size, 0))), 0, 0.0)
 
 
 def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
-    """Fourier series of one period, without and with amplitudes that change linearly in time.
+    """Fourier series of one period, with constant amplitudes and with ones linear in time.
 
-    The latter for directions that turn. The best of each number of harmonics.
+    The latter allow for changing directions. Returns the best for each number of harmonics.
     """
     t, span = linear.t, float(linear.t[-1])
     candidates = _peaks(linear, max_frequency)
@@ -135,7 +136,7 @@ def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
     ]
     chi2 = [linear.chi2(waves(t, f * np.arange(1, 5))) for f in frequencies]
     best = [frequencies[k] for k in np.argsort(chi2)[:4]]
-    # a series of f / 2 and few harmonics may be that of f
+    # a series of few harmonics of f may be one of f / 2 or 2 f
     others = (f * part for f in best[:2] for part in (0.5, 2.0))
     best += [f for f in others if 1 <= f * span < max_frequency * span]
     log_trials = float(np.log(max(max_frequency * span, 1.0)))
@@ -161,11 +162,11 @@ def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
 
 
 def _peaks(linear: Linear, max_frequency: float) -> list[float]:
-    """Frequencies whose series of two or of four harmonics explain most."""
+    """Frequencies whose series of two or four harmonics explain the most variance."""
     curve, over = linear.curve, 6
     columns = curve.columns(np.inf)[0]
     scan = Scan.of(curve.t, curve.magnitude, columns, max_frequency, over, max(_SCAN_ORDERS))
-    # a whole turn within the light curve at least: slower waves are trends
+    # at least one cycle within the light curve: slower waves are trends
     nodes = np.arange(over, scan.count)
     if not nodes.size:
         return [1 / float(linear.t[-1])]
@@ -177,8 +178,8 @@ def _peaks(linear: Linear, max_frequency: float) -> list[float]:
 
 
 def _refine_frequency(linear: Linear, frequency: float, columns, steps: int = 11) -> float:
-    """The frequency near ``frequency`` at which ``columns(f)`` explain most, of a turn within the
-    light curve at least."""
+    """The frequency near ``frequency`` at which ``columns(f)`` fit best; at least one cycle within
+    the light curve."""
     width = 0.25 / linear.t[-1]
     for _ in range(2):
         near = np.maximum(frequency + width * np.linspace(-1, 1, steps), 1 / linear.t[-1])
@@ -188,7 +189,7 @@ def _refine_frequency(linear: Linear, frequency: float, columns, steps: int = 11
 
 
 def two_periods(linear: Linear, pairs: Pairs, solutions) -> list[Residuals]:
-    """Fourier series of two frequencies: of the best pairs of lines, and of the best bodies."""
+    """Fourier series of two frequencies, from the best pairs of lines and from the best bodies."""
     t = linear.t
     log_trials = _log_pairs(pairs.max_frequency, t[-1])
     choices = [(LINES, g, h) for g, h in zip(pairs.f_phi[:3], pairs.f_psi[:3], strict=True)]
@@ -214,7 +215,7 @@ def two_periods(linear: Linear, pairs: Pairs, solutions) -> list[Residuals]:
 
 
 def tumbler(linear: Linear, pairs: Pairs, best) -> Residuals:
-    """A tumbling body: two moments, attitude, rates, and the shape, as far as it is determined."""
+    """The model of a tumbling body, with the parameters that the points determine."""
     log_trials = _log_pairs(pairs.max_frequency, linear.t[-1])
     rest = linear.curve.magnitude - best.model
     return Residuals(
@@ -223,13 +224,13 @@ def tumbler(linear: Linear, pairs: Pairs, best) -> Residuals:
 
 
 def _log_pairs(max_frequency: float, span: float) -> float:
-    """Independent pairs of frequencies of a grid, as a logarithm."""
+    """Logarithm of the number of independent pairs of frequencies on a grid."""
     return float(2 * np.log(max(max_frequency * span, 1.0)) - np.log(2))
 
 
 @jax.jit
 def _rotators(x, arrays, basis):
-    """Residuals (b, n) of ellipsoids that rotate about their third axis, and derivatives."""
+    """Residuals (b, n) of ellipsoids that rotate about their third axis, and their derivatives."""
     t, sun, observer, root, data = arrays
 
     def residuals(x):
@@ -256,7 +257,6 @@ def _rotators(x, arrays, basis):
         whole = jnp.concatenate([value, jnp.zeros(basis.shape[0] - t.shape[0])])
         return data - whole + basis @ (basis.T @ whole)
 
-    # mag per (log of an axis) is held loosely, as in fits of tumbling bodies
     value = jax.vmap(residuals)(x)
     slopes = jax.vmap(jax.jacfwd(residuals))(x)
     return value, slopes
@@ -265,10 +265,10 @@ def _rotators(x, arrays, basis):
 class Rotator(NamedTuple):
     """An ellipsoid that rotates about its third axis."""
 
-    values: np.ndarray  # residuals (n,) [mag], model less data but for the sign
-    # logarithms of the second and third axis over the first, longitude and latitude of the pole
-    # and phase [rad], and frequency
-    parameters: np.ndarray  # (6,)
+    values: np.ndarray  # residuals (n,) [mag], data minus model
+    # (6,): logarithms of the second and third axis over the first, longitude and latitude of the
+    # pole and phase [rad], and frequency
+    parameters: np.ndarray
     chi2: float
 
     @property
@@ -277,17 +277,17 @@ class Rotator(NamedTuple):
 
 
 def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
-    """The best ellipsoids that rotate about their third axis, near one of ``periods``.
+    """Ellipsoids that rotate about their third axis with about one of ``periods``, the best first.
 
-    The best first; up to `_POLES` with different poles for each period, its half and its double:
-    which of them is true may be seen only with another shape. Empty without directions.
+    Up to `_POLES` with different poles for each period, its half and its double: which of them is
+    right may be decided only with another shape. Empty without directions.
     """
     curve = linear.curve
     if curve.sun is None or curve.observer is None:
         return []
-    # what the law gives a sphere is a part of the phase function
-    arrays, basis = _filled_up(linear, curve.sun, curve.observer)
-    longitude, latitude = _directions(12)
+    # The columns linear and quadratic in the phase angle absorb the light of a sphere by the law.
+    arrays, basis = _padded_arguments(linear, curve.sun, curve.observer)
+    longitude, latitude = _spiral_directions(12)
     turn = np.pi * np.arange(4) / 4
     grid = np.array(
         [
@@ -298,9 +298,9 @@ def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
     )
     frequencies: list[float] = []
     for f in (f for p in periods for f in (1 / p, 0.5 / p, 2 / p)):
-        # those that steps of the fit would join are one start
-        known = min((abs(f - other) for other in frequencies), default=np.inf)
-        if f <= max_frequency and known > _JOINED / linear.t[-1]:
+        # frequencies from which the fit would converge to the same one are one start
+        distance = min((abs(f - other) for other in frequencies), default=np.inf)
+        if f <= max_frequency and distance > _JOINED / linear.t[-1]:
             frequencies.append(float(f))
     out: list[Rotator] = []
     for f in sorted(frequencies):
@@ -325,9 +325,9 @@ def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
     return sorted(out, key=lambda r: r.chi2)
 
 
-def _filled_up(linear: Linear, sun: np.ndarray, observer: np.ndarray):
-    """Arrays of `_rotators`, with points of no weight and columns of zeros: one program serves many
-    light curves."""
+def _padded_arguments(linear: Linear, sun: np.ndarray, observer: np.ndarray):
+    """Arguments of `_rotators`, padded with points of zero weight and columns of zeros, so that one
+    program serves many light curves."""
     n, priors, columns = linear.t.size, len(linear.rows) - linear.t.size, linear.basis.shape[1]
     missing, more, spare = -n % BLOCK, -priors % 16, -columns % 16
 
@@ -349,30 +349,30 @@ def _filled_up(linear: Linear, sun: np.ndarray, observer: np.ndarray):
 
 
 def round_rotators(periods) -> list[np.ndarray]:
-    """Parameters of nearly round ellipsoids with poles all over the sky, in `Rotator`'s order.
+    """``Rotator.parameters`` of nearly round ellipsoids with poles distributed over the sky.
 
-    Starts for convex bodies whose light is far from that of any ellipsoid: the best pole of an
-    ellipsoid is then unrelated to that of the body.
+    They are starts for convex bodies whose light differs much from that of any ellipsoid: the best
+    pole of an ellipsoid is then unrelated to that of the body.
     """
     return [
         np.array([-0.05, -0.2, longitude, latitude, 0.0, 1 / period])
         for period in periods
-        for longitude, latitude in zip(*_directions(_ROUND), strict=True)
+        for longitude, latitude in zip(*_spiral_directions(_ROUND), strict=True)
     ]
 
 
-def _directions(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Longitudes and latitudes (count,) [rad], evenly on the sphere along a spiral."""
+def _spiral_directions(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Longitudes and latitudes (count,) [rad], evenly distributed on the sphere along a spiral."""
     k = np.arange(count) + 0.5
     return np.pi * (1 + 5**0.5) * k, np.arcsin(1 - 2 * k / count)
 
 
 def _improve_rotators(x, arrays, basis, steps: int = 25):
-    """Levenberg-Marquardt for rotators (b, 6); the parameters, and residuals (b, n)."""
+    """Levenberg-Marquardt for rotators (b, 6). Returns parameters, and residuals (b, n)."""
     damping = np.full(len(x), 1e-2)
     value, slopes = map(np.asarray, _rotators(x, arrays, basis))
     for _ in range(steps):
-        # axes' ratios 0 +- 0.8 in their logarithms
+        # prior of the logarithms of the axes' ratios: 0 +- 0.8
         prior_precision = np.diag([0.8**-2, 0.8**-2, 0, 0, 0, 0])
         matrix = np.einsum("bni,bnj->bij", slopes, slopes) + prior_precision
         right = np.einsum("bni,bn->bi", slopes, value) + x @ prior_precision
@@ -383,10 +383,10 @@ def _improve_rotators(x, arrays, basis, steps: int = 25):
         step *= np.minimum(1, 0.5 / np.maximum(np.abs(step[:, :5]).max(1), 1e-30))[:, None]
         trial = x - step
         new, new_slopes = map(np.asarray, _rotators(trial, arrays, basis))
-        prior_precision = prior_precision[0, 0]
+        axis_precision = prior_precision[0, 0]
 
-        def cost(value, x, prior_precision=prior_precision):
-            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + prior_precision * (
+        def cost(value, x, axis_precision=axis_precision):
+            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + axis_precision * (
                 x[:, :2] ** 2
             ).sum(1)
 
@@ -401,7 +401,7 @@ def _improve_rotators(x, arrays, basis, steps: int = 25):
 def compare_models(
     linear: Linear, candidates: list[Residuals], effective_correlation
 ) -> tuple[Model, ...]:
-    """Evidence of ``candidates``, with points correlated in the residuals of the best joined.
+    """Evidence of ``candidates``; correlated points count less, by the residuals of the best one.
 
     ``effective_correlation(curve, residuals over errors)``: how many residuals count as one.
     """

@@ -1,4 +1,4 @@
-"""Trial bodies with given periods: random draws, and alignment with a light curve in phase."""
+"""Trial bodies with given periods: random draws, and alignment of their phases with the data."""
 
 from typing import NamedTuple
 
@@ -23,30 +23,30 @@ from polhode.lightcurve._least_squares import select
 
 # Alignment of trial bodies with the phases of a light curve's Fourier series.
 #
-# While the directions to Sun and observer are constant, the light of a body is a function of its
-# two phase angles (a torus), and a shift of both angles multiplies the Fourier coefficients by
-# phase factors. The light is therefore computed once, at the 72 nodes of a grid on the torus, and
-# every node is compared with the data through the normal equations of the series: 72 starting
-# phases of a body cost about as much as its light at 72 times, whatever the number of points.
+# For constant directions to Sun and observer, the light of a body is a function of its two phase
+# angles (on a torus), and a shift of both angles multiplies the Fourier coefficients by phase
+# factors. The light is therefore computed once, at the 72 nodes of a grid on the torus, and every
+# node is compared with the data through the normal equations of the series: 72 starting phases of a
+# body cost about as much as its light at 72 times, whatever the number of points.
 
-# Sums i f_phi + j f_psi compared, of SAM and of LAM: nearly all of an ellipsoid's light.
+# Sums i f_phi + j f_psi that are compared, for SAM and for LAM: nearly all of an ellipsoid's light.
 _SUMS = np.array(
     [
         [(1, 1), (2, 0), (2, 2), (1, -1), (0, 2), (1, 3), (3, 1), (4, 0), (2, -2), (3, 3), (4, 2)],
         [(1, 0), (2, 0), (2, 2), (1, 2), (0, 2), (1, -2), (3, 0), (4, 0), (4, 2), (3, 2), (4, 4)],
     ]
 )
-_TURN, _HALF = 12, 6  # nodes of a turn about the momentum, and of half a period of the nutation
-GAIN = (0.6, 1.7)  # of the variations, in a trial's score
+_TURN, _HALF = 12, 6  # nodes in a turn about the momentum, and in half a period of the nutation
+GAIN = (0.6, 1.7)  # limits of the factor by which a trial's light variations are scaled
 _NODES = np.stack(np.meshgrid(np.arange(_TURN), np.arange(_HALF), indexing="ij"), -1).reshape(-1, 2)
 _ANGLES = 2 * np.pi * np.einsum("nc,mkc->mnk", _NODES / (_TURN, 2 * _HALF), _SUMS)
 
 
 def series(points: Points, f_phi, f_psi, long_axis) -> tuple[np.ndarray, np.ndarray]:
-    """Right sides (h, 2 k) and matrices (h, 2 k, 2 k) of the least squares of the sums' waves.
+    """Right sides (h, 2 k) and matrices (h, 2 k, 2 k) of normal equations of the waves at the sums.
 
-    Of frequencies (h,) and modes (h,), the points weighted by their errors. What offsets and the
-    phase angle explain is projected out.
+    For frequencies (h,) and modes (h,), with the points weighted by their errors. Offsets and a
+    quadratic function of the phase angle are projected out.
     """
     is_point = _present_points(points)
     t, alpha, data, weight = (
@@ -70,7 +70,7 @@ def series(points: Points, f_phi, f_psi, long_axis) -> tuple[np.ndarray, np.ndar
 
 
 def directions(points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (3,) to Sun and observer in the mean."""
+    """Mean directions (3,) to Sun and observer, as unit vectors."""
     is_point = _present_points(points)
     means = (
         np.array([np.asarray(x[0])[is_point].mean() for x in v])
@@ -81,26 +81,26 @@ def directions(points: Points) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _present_points(points: Points) -> np.ndarray:
-    return np.asarray(points.weight[0]) > 0  # others pad
+    return np.asarray(points.weight[0]) > 0  # others are padding
 
 
 @jax.jit
 def align_phases(
     bodies: Bodies, f_phi, f_psi, long_axis, right, matrix, sun, observer
 ) -> tuple[Bodies, Float[Array, " b"]]:
-    """The bodies (b,), of frequencies (b,), where their light comes nearest to the series.
+    """The bodies (b,), with frequencies (b,), at the phases where their light best fits the series.
 
-    ``right`` (b, 2 k), ``matrix`` (b, 2 k, 2 k): of `series`; ``sun``, ``observer`` (3,): of
-    `directions`. Only attitude and rates change; the momentum keeps its direction. And by how much
-    each lowers chi-square.
+    ``right`` (b, 2 k), ``matrix`` (b, 2 k, 2 k): from `series`; ``sun``, ``observer`` (3,): from
+    `directions`. Only attitude and rates change, not the momentum in space. Also returns the
+    decrease of chi-square by each body.
     """
     u, wxyz = bodies
     moments, omega = moments_of(u), tuple(u[:, k] for k in (4, 5, 6))
-    # Half a period of the nutation is enough: by the symmetry of an ellipsoid the other half
-    # repeats the same light, in SAM after half a turn about the momentum.
+    # Half a period of the nutation suffices: by the symmetry of an ellipsoid the other half repeats
+    # the same light, in SAM combined with half a turn about the momentum.
     times = jnp.arange(_HALF)[None] / (2 * _HALF) / f_psi[:, None]
     rates, q = free_motion(moments, tuple(wxyz[:, k] for k in range(4)), omega, times)
-    assert rates is not None  # neither was declined
+    assert rates is not None  # for the type checker: both are requested
     assert q is not None
     pole = rotation.rotate(
         wxyz, jnp.stack([a * b for a, b in zip(moments, omega, strict=True)], -1)
@@ -151,25 +151,27 @@ def align_phases(
 
 # Trial bodies with given periods, many at a time, and their misfit.
 #
-# The inertia is drawn first and the rates are then solved for the required ratio of periods
-# (bisection between small nutation and the separatrix) and scaled to the required P_phi. Every
-# trial therefore has the right frequencies, and the random search has two dimensions fewer: rates
-# drawn at random would rarely hit both frequencies to the resolution of a long light curve.
+# The inertia is drawn first. The rates are then solved for the required ratio of periods (by
+# bisection between small nutation and the separatrix) and scaled to the required P_phi. Every trial
+# therefore has the right frequencies, and the random search has two dimensions fewer: random rates
+# would rarely have both frequencies to the resolution of a long light curve.
 
 CHUNK = 2048
 _light = jax.jit(magnitudes, static_argnums=0)
 _BISECTIONS = 24
-_PART = 4  # of so many bodies the one whose light comes nearest to the series is looked at
-_SLOPE_SIGMA = 0.5  # of the phase function, in a trial's score [mag / rad]
+_PART = 4  # one body of this many, whose light best fits the series, is compared with the points
+_SLOPE_SIGMA = 0.5  # prior deviation of a linear phase function in a trial's score [mag / rad]
 
 
 class Draws(NamedTuple):
-    """What a trial body is made from, besides its mode; arrays (b, ...)."""
+    """Random numbers and frequencies that define trial bodies, besides the mode; (b, ...)."""
 
     inertia: Float[Array, "b 2"]  # in [0, 1]: axes' ratios of the homogeneous ellipsoid
-    late: Float[Array, " b"]  # part of a turn about the long axis, at t = 0
+    late: Float[Array, " b"]  # phase of the nutation at t = 0, in periods
     wxyz: Float[Array, "b 4"]  # not normalised
-    shape: Float[Array, "b 2"]  # normal deviates: logarithms of the shape's ratios by the inertia's
+    shape: Float[
+        Array, "b 2"
+    ]  # normal deviates of the logarithms of the shape's over the inertia's
     f_phi: Float[Array, " b"]
     f_psi: Float[Array, " b"]
 
@@ -181,7 +183,10 @@ def _axes(inertia):
 
 
 def _spins(u, part, long_axis):
-    """From small nutation (part 0) to the separatrix (1), in the plane of axes x and z."""
+    """Moments, rates and periods of motions from small nutation (``part`` 0) to the separatrix (1).
+
+    The rates lie in the plane of axes x and z and have unit angular momentum.
+    """
     a, b, c = moments_of(u)
     split = jnp.arcsin(jnp.sqrt((1 / a - 1 / b) / (1 / a - 1 / c)))
     along = jnp.broadcast_to(long_axis, split.shape)
@@ -197,7 +202,7 @@ def _periods_possible(u, long_axis, ratio):
 
 @jax.jit
 def _draw_chunk(key, f_phi, f_psi, long_axis) -> Draws:
-    """Anything possible; of six inertias the first that allows the periods."""
+    """Random draws; of six inertias the first that allows the periods."""
     count, keys = f_phi.shape[0], jax.random.split(key, 4)
     inertia = jax.random.uniform(keys[0], (6, count, 2))
     allowed = _periods_possible(_axes(inertia), long_axis, (f_psi / f_phi)[None])
@@ -214,7 +219,7 @@ def _draw_chunk(key, f_phi, f_psi, long_axis) -> Draws:
 
 @jax.jit
 def _build_chunk(draws: Draws, long_axis, spread):
-    """Bodies (b,) with the periods asked, and whether there are any for the inertia drawn."""
+    """Bodies (b,) with the required periods, and whether the inertia drawn allows these."""
     u, ratio = _axes(draws.inertia), draws.f_psi / draws.f_phi
 
     def halve(_, ends):
@@ -230,7 +235,7 @@ def _build_chunk(draws: Draws, long_axis, spread):
     scale = periods.P_phi * draws.f_phi
     omega = tuple(x * scale for x in omega)
     omega, _ = free_motion(moments, None, omega, draws.late / draws.f_psi, attitude=False)
-    assert omega is not None  # the rates were not declined
+    assert omega is not None  # for the type checker: rates are requested
     near = jnp.abs(periods.P_phi / periods.P_psi / ratio - 1) < 0.01
     good = _periods_possible(u, long_axis, ratio) & near & jnp.isfinite(sum(omega))
     shape = u + spread * draws.shape
@@ -239,7 +244,7 @@ def _build_chunk(draws: Draws, long_axis, spread):
 
 
 def _in_chunks(function, total: int, *arrays):
-    """``function(number, *chunks)`` of arrays (total, ...), joined."""
+    """``function(number, *chunks)`` of padded chunks of arrays (total, ...), concatenated."""
     parts = []
     for k, start in enumerate(range(0, total, CHUNK)):
         index = np.minimum(np.arange(start, start + CHUNK), total - 1)
@@ -248,7 +253,8 @@ def _in_chunks(function, total: int, *arrays):
 
 
 def build(draws: Draws, long_axis, phase: AbstractPhase, spread: float = 0.15):
-    """Bodies (b,), and which exist; ``spread``: of the shape's ratios by the inertia's, in ln."""
+    """Bodies (b,), and which of them exist; ``spread``: standard deviation of the logarithms of the
+    shape's axes' ratios about those of the inertia."""
     total = len(long_axis)
     bodies, good = _in_chunks(
         lambda _, d, mode: _build_chunk(d, mode, spread), total, draws, np.asarray(long_axis)
@@ -258,14 +264,14 @@ def build(draws: Draws, long_axis, phase: AbstractPhase, spread: float = 0.15):
 
 
 def perturb(key, meant: Hypotheses, blur: float) -> Hypotheses:
-    """Frequencies within ``blur`` of those meant."""
+    """The hypotheses with frequencies shifted at random by up to ``blur``."""
     shake = blur * np.asarray(jax.random.uniform(key, (2, len(meant.f_phi)), minval=-1.0))
     f_phi, f_psi = (np.maximum(f + d, f / 2) for f, d in zip(meant[:2], shake, strict=True))
     return Hypotheses(f_phi, f_psi, meant.long_axis)
 
 
 def draw(key, hypotheses: Hypotheses, each: int) -> tuple[Draws, np.ndarray]:
-    """``each`` of every hypothesis, and their modes."""
+    """Draws of ``each`` bodies for every hypothesis, and their modes."""
     f_phi, f_psi, long_axis = (np.repeat(x, each) for x in hypotheses)
     draws = _in_chunks(
         lambda k, *x: _draw_chunk(jax.random.fold_in(key, k), *x),
@@ -279,7 +285,7 @@ def draw(key, hypotheses: Hypotheses, each: int) -> tuple[Draws, np.ndarray]:
 
 @jax.jit
 def _misfit(light, points: Points, solver):
-    """Misfit (b,) and gain (b,): what the body's variations are multiplied by to fit best."""
+    """Misfit (b,) and gain (b,), the factor of the light variations that fits best."""
 
     def free_of_offsets(x):
         return x - ((x * points.weight) @ points.columns.T @ solver) @ points.columns
@@ -298,8 +304,8 @@ def _misfit(light, points: Points, solver):
 def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Robust mean squares of the residuals [mag^2] of each body (b,), and gains (b,).
 
-    Offsets are fitted, and the light's variations may be a little greater or smaller all over: by
-    the gain, as other axes' ratios would make them.
+    Offsets are fitted, and the light variations are multiplied by the gain, which stands for a
+    change of the axes' ratios.
     """
     # A column linear in the phase angle stands for the phase function, which is not fitted yet.
     slope = jnp.where(points.weight > 0, points.alpha, 0.0)
@@ -321,7 +327,7 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.nd
 
 
 class Trials(NamedTuple):
-    """The best bodies tried of every hypothesis, those of one beside each other; (b, ...)."""
+    """The best trial bodies (b, ...) of every hypothesis, grouped by hypothesis."""
 
     bodies: Bodies
     gain: np.ndarray
@@ -338,10 +344,10 @@ def best_trials(
     few: Points,
     blur: float,
 ) -> Trials:
-    """The ``keep`` best of each hypothesis among about ``count`` bodies drawn.
+    """The ``keep`` best bodies of each hypothesis, from about ``count`` draws in total.
 
-    Their phases are those that the series of all ``points`` prefers, their misfit that of ``few``:
-    directions that turn are left to the latter.
+    Their phases are aligned with the series of all ``points``, for constant directions. The misfit
+    to the points ``few``, with their actual directions, then selects the best.
     """
     many = len(meant.f_phi)
     each = max(keep, count // many)
@@ -369,7 +375,7 @@ def best_trials(
 
 
 def _smallest(values: np.ndarray, many: int, keep: int) -> np.ndarray:
-    """Numbers of the ``keep`` least of each of ``many`` equal parts."""
+    """Indices of the ``keep`` smallest values in each of ``many`` equal parts."""
     each = len(values) // many
     best = np.argsort(values.reshape(many, each), axis=1)[:, :keep]
     return (best + each * np.arange(many)[:, None]).reshape(-1)

@@ -1,4 +1,4 @@
-"""Solutions of a light curve, their uncertainties, and what it cannot show of them."""
+"""Solutions of a light curve, their uncertainties, and notes on what it cannot determine."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -32,13 +32,11 @@ from polhode.lightcurve._nulls import Model
 if TYPE_CHECKING:
     from polhode.lightcurve._verdict import Verdict
 
-# What a light curve tells of each body that explains it, and what it cannot tell.
-
-# Chi-square per degree of freedom at which a body explains a light curve.
+# Chi-square per degree of freedom up to which a body explains a light curve.
 REACHED = 1.3
-_PART = 256  # bodies whose periods are computed at once
-FIXED = 5.0  # deg: directions that change by less are one geometry
-EXCLUDED = 1e-3  # odds of a solution below which it is
+_PART = 256  # bodies per call of the program that computes their periods
+FIXED = 5.0  # deg: directions that change by less count as constant
+EXCLUDED = 1e-3  # odds below which a solution is excluded
 
 
 # Quantities of ``Solution.covariance``, in its order.
@@ -60,8 +58,8 @@ class Solution(NamedTuple):
     mode: Mode
     rms: float  # weighted, of the residuals [mag]
     cost: float  # robust chi-square, priors included
-    probability: float  # exp(-(cost - best) / 2 / scale^2 / alike): 1 for the best
-    moments: np.ndarray  # (3,), of the greatest
+    probability: float  # odds exp(-(cost - best) / 2 / scale^2 / alike): 1 for the best
+    moments: np.ndarray  # (3,) over the largest
     moments_std: np.ndarray  # (3,)
     axes: np.ndarray  # (3,) semi-axes over the longest
     pole: np.ndarray  # (2,) longitude and latitude of the angular momentum [deg]
@@ -69,16 +67,17 @@ class Solution(NamedTuple):
     wxyz: np.ndarray  # (4,) at t = 0, the first time
     omega_body: np.ndarray  # (3,) [rad / time unit]
     coefficients: np.ndarray  # of the phase function
-    offsets: np.ndarray  # of the columns
+    offsets: np.ndarray  # coefficients of ``LightCurve.columns`` [mag]
     model: np.ndarray  # (n,) magnitudes, offsets included
     weights: np.ndarray  # (n,) in [0, 1]: robust weight of each point
     mirror_of: int | None  # number of the solution whose mirror image this is
-    # (k,) of the logarithm of the surface density over that of the ellipsoid; None: an ellipsoid
+    # (k,) coefficients of the logarithm of the surface density over that of the ellipsoid; None: an
+    # ellipsoid
     harmonics: np.ndarray | None = None
-    parameters: float = 10.0  # that the points determine, besides offsets and phase function
+    # effective number that the points determine, not counting offsets and phase function
+    parameters: float = 10.0
     epoch: float = 0.0  # time of ``wxyz`` and ``omega_body``, the first of the light curve
-    # (8, 8) of P_phi, P_psi, moments (3) and the direction of the momentum in space (3)
-    covariance: np.ndarray | None = None
+    covariance: np.ndarray | None = None  # (8, 8) in the order of ``COVARIANCE_OF``
 
     @property
     def P_phi_short_axis(self) -> float:
@@ -95,19 +94,19 @@ class Solution(NamedTuple):
         The columns are those of the table of tumblers of DAMIT (astro.troja.mff.cuni.cz/projects/
         damit): lambda, beta, P_psi, P_phi, I1, I2, phi0, psi0, JD0, in degrees, hours and days;
         moments, angles and periods in the convention of Kaasalainen, Astron. Astrophys. 376 (2001)
-        302, which the file states. The times of the light curve are days from the Julian date
-        ``jd_of_zero`` on, its directions ecliptic (J2000). ``shape.txt``: vertices and triangles of
+        302, which the file states. The times of the light curve must be days since the Julian date
+        ``jd_of_zero``, its directions ecliptic (J2000). ``shape.txt``: vertices and triangles of
         the ellipsoid. Returns the folder.
 
         Raises ValueError for a solution with a convex shape, or one that does not tumble,
-        FileNotFoundError for a folder that is not there.
+        FileNotFoundError for a folder that does not exist.
         """
         from polhode.lightcurve._files import write_damit
 
         return write_damit(self, folder, jd_of_zero=jd_of_zero)
 
     def lines(self, count: int = 3) -> tuple[tuple[str, float], ...]:
-        """Main lines of the light of this mode, with their periods: ``("2 f_phi", period)``."""
+        """Main spectral lines of this mode, with their periods: ``("2 f_phi", period)``."""
         sums = LAM if self.mode == Mode.LAM else SAM
         return tuple(
             (sum_name(i, j), 1 / (i / self.P_phi + j / self.P_psi)) for i, j in list(sums)[:count]
@@ -115,24 +114,25 @@ class Solution(NamedTuple):
 
 
 class LightCurveFit(NamedTuple):
-    """All distinct solutions, the best first, and what may be claimed: ``verdict``."""
+    """Result of ``fit_light_curve``: all distinct solutions, the best first, and a verdict."""
 
     solutions: tuple[Solution, ...]
     curve: LightCurve
     pairs: Pairs
     hypotheses: Hypotheses
-    scale: float  # residuals of the best over the errors assumed
-    alike: float  # so many residuals count as one, because neighbours are alike; 1: independent
-    offset_sigma: float | None  # spread of groups' offsets [mag]: given or learnt; None: default
-    notes: tuple[str, ...]  # what this light curve cannot show
-    verdict: "Verdict"  # what may be claimed
+    scale: float  # residuals of the best solution over the assumed errors
+    alike: float  # number of correlated residuals that count as one; 1: independent
+    # standard deviation of the groups' offsets [mag], requested or estimated; None: default
+    offset_sigma: float | None
+    notes: tuple[str, ...]  # limitations of this light curve
+    verdict: "Verdict"
     reasons: tuple[str, ...]  # of the verdict
     # Principal-axis rotation rating in the manner of Pravec et al., Icarus 173 (2005) 108: from -4
-    # (tumbling, with one physical model) over 0 (nothing is known) to 2 (one period explains all)
+    # (tumbling, with one physical model) through 0 (undecided) to 2 (one period explains all)
     par: int
-    models: tuple[Model, ...]  # null hypotheses first, and their evidence
-    misfit: float  # residuals of the best over the errors of the points, without the floor
-    agreement: float  # part of resampled light curves in which the best periods stay the best
+    models: tuple[Model, ...]  # the best of each kind with its evidence, null hypotheses first
+    misfit: float  # residuals of the best solution over the errors of the points, without floor
+    agreement: float  # part of resampled light curves in which the best periods remain the best
     phase: AbstractPhase | None = None  # phase function of the ellipsoids
 
     @property
@@ -141,7 +141,7 @@ class LightCurveFit(NamedTuple):
 
 
 def frequencies(bodies: Bodies):
-    """f_phi, f_psi, and mode of bodies."""
+    """f_phi, f_psi and mode (b,) of bodies."""
     return in_parts(_periods, _PART, bodies)
 
 
@@ -164,7 +164,7 @@ def _momentum(bodies: Bodies):
 
 
 def _derived_quantities(x, wxyz):
-    """ln P_phi, ln P_psi, moments over the greatest, direction of the momentum in space."""
+    """ln P_phi, ln P_psi, moments over the largest, direction of the momentum in space: (8,)."""
     unknowns, turn = x[:-3], x[-3:]
     moments = moments_of(unknowns)
     omega = unknowns[4:7]
@@ -194,10 +194,10 @@ def derivatives_of_derived(bodies: Bodies) -> np.ndarray:
 
 
 class Linearised(NamedTuple):
-    """Residuals of a solution over their errors, and their first-order model; offsets included.
+    """Linear model of the residuals of a solution over their errors; offsets are unknowns too.
 
-    The cost after a step x of the unknowns is that of ``residuals + derivatives @ x``, and of
-    what is known before ``x @ prior @ x + 2 gradient @ x + prior_cost``.
+    The cost after a step x of the unknowns is the robust cost of ``residuals + derivatives @ x``
+    plus that of the priors, ``x @ prior @ x + 2 gradient @ x + prior_cost``.
     """
 
     residuals: np.ndarray  # (n,)
@@ -208,13 +208,13 @@ class Linearised(NamedTuple):
 
 
 class Described(NamedTuple):
-    """Solutions, the best first, and what their residuals say."""
+    """Solutions, the best first, and statistics of their residuals."""
 
     solutions: tuple[Solution, ...]
-    scale: float  # residuals of the best over the errors assumed
-    alike: float  # so many neighbouring residuals count as one
+    scale: float  # residuals of the best solution over the assumed errors
+    alike: float  # number of correlated residuals that count as one
     linearised: tuple[Linearised, ...]  # of each solution
-    # what the best ellipsoid became with a convex shape, also where it is no solution of the list
+    # the best ellipsoid after a fit of a convex shape, even if it is not in the list
     refined_ellipsoid: Solution | None = None
 
 
@@ -232,7 +232,8 @@ def describe_solutions(
         slopes,
         jnp.asarray(best.offsets),
         problem.points,
-        jnp.asarray(np.full(len(index), limit)),  # strong, as in the search: one program
+        # an array without a weak type, as in the search, so that no second program is compiled
+        jnp.asarray(np.full(len(index), limit)),
     )
     model = np.asarray(value + best.offsets @ problem.points.columns)[:, :n]
     robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
@@ -305,21 +306,22 @@ def describe_solutions(
 
 
 def covariance_of_periods(covariance: np.ndarray, f_phi: float, f_psi: float) -> np.ndarray:
-    """A covariance of ln P_phi, ln P_psi, ... as one of the periods themselves."""
+    """The covariance of P_phi, P_psi, ... from that of ln P_phi, ln P_psi, ..."""
     size = np.r_[1 / f_phi, 1 / f_psi, np.ones(len(covariance) - 2)]
     return covariance * size * size[:, None]
 
 
 def effective_correlation(curve: LightCurve, residuals: np.ndarray) -> float:
-    """How many residuals (n,), over their errors, count as one.
+    """Number of correlated residuals (n,), over their errors, that count as one.
 
-    The variance of their sum over that of independent ones, if those of one run (one group, no gap
-    over half a day) are alike by rho^k, k points apart; rho: measured between neighbours.
+    It is the variance of their sum over that of independent ones, with the correlation rho^k of
+    residuals k points apart within a run (one group, no gap over half a day). rho is the measured
+    correlation of neighbours.
     """
     together = (np.diff(curve.group) == 0) & (np.diff(curve.t) < 0.5)
     a, b = residuals[:-1][together], residuals[1:][together]
     rho = (a @ b) / max(np.sqrt((a @ a) * (b @ b)), 1e-300)
-    # rho within its error of 0 says nothing
+    # less than two standard deviations above zero: treated as independent
     if rho < 2 / np.sqrt(max(a.size, 1)):
         return 1.0
     run = np.cumsum(np.r_[0, ~together])
@@ -330,7 +332,10 @@ def effective_correlation(curve: LightCurve, residuals: np.ndarray) -> float:
 
 
 def same_periods(solutions, resolution: float) -> list[int]:
-    """For each solution the number of the first with its mode and, to half of 1/span, periods."""
+    """For each solution the index of the first one with its mode and periods.
+
+    Frequencies agree if they differ by less than half of ``resolution`` (1/span).
+    """
     out: list[int] = []
     for k, s in enumerate(solutions):
         first = k
@@ -353,7 +358,7 @@ def change_of_directions(curve: LightCurve) -> float:
 
 
 def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[str, ...]:
-    """What this light curve cannot show, in sentences."""
+    """Sentences on what this light curve cannot determine."""
     notes = list(curve.notes)
     sun, observer = curve._known_directions()
     directions = np.vstack([sun, observer])
@@ -369,13 +374,16 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
             "Sun and observer stay near one plane: poles mirrored in it fit nearly as well."
         )
     if np.degrees(curve.alpha.max()) < 3:
-        notes.append("All phase angles are below 3 deg: poles are known up to turns about the ray.")
+        notes.append(
+            "All phase angles are below 3 deg: poles are known only up to a rotation"
+            " about the line of sight."
+        )
     span = np.ptp(curve.t)
     best = solutions[0]
     for name, period in (("P_phi", best.P_phi), ("P_psi", best.P_psi)):
         if span < 3 * period:
             notes.append(f"Fewer than three {name} were seen: it is uncertain beyond its error.")
-    # a list that ends before the odds do is not the whole of them
+    # If the last solution of the limited list is possible, further ones may be as well.
     least = "at least " if solutions[-1].probability > EXCLUDED else ""
     classes = same_periods(solutions, 1 / span)
     possible = [k for k, s in enumerate(solutions) if s.probability > EXCLUDED]
@@ -393,8 +401,8 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
         )
     if scale**2 > REACHED:
         notes.append(
-            f"Residuals are {scale:.1f} times the errors assumed: the body is not the whole truth,"
-            " and errors follow from the residuals; trust none to better than a factor of two."
+            f"Residuals are {scale:.1f} times the errors assumed: the model is incomplete, and"
+            " errors follow from the residuals: they are uncertain by a factor of two."
         )
     if alike > 1:
         notes.append(
@@ -403,18 +411,18 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
     return tuple(notes)
 
 
-# A night whose comparison star varies, or whose errors are too small, by its residuals.
+# Nights with a variable comparison star, or with errors that are too small, from their residuals.
 
-_TREND = 5.0  # standard deviations of the slope of a night's residuals from which it is named
-_NOISY = 2.0  # scatter of a night over that of the others from which it is named
-_NIGHT_POINTS = 8  # points of a night below which it is not judged
+_TREND = 5.0  # least trend of a night's residuals, in standard deviations, that is reported
+_NOISY = 2.0  # least ratio of a night's scatter to that of the others that is reported
+_NIGHT_POINTS = 8  # least number of points of a night for these tests
 
 
 def notes_on_groups(curve: LightCurve, residuals: np.ndarray, alike: float) -> tuple[str, ...]:
-    """Names of the groups whose residuals (n,) [mag] have a trend, or scatter too much.
+    """Notes on groups whose residuals (n,) [mag] have a trend, or scatter too much.
 
-    The residuals are those of the best body. A slope counts in standard deviations that follow from
-    the scatter of all groups and from how many neighbours count as one, ``alike``.
+    The residuals are those of the best body. The standard deviation of a trend follows from the
+    scatter of all groups and from ``alike``, the number of residuals that count as one.
     """
     weighted = residuals / curve.sigma
     scale = 1.4826 * max(float(np.median(np.abs(weighted))), 1e-12)
@@ -449,7 +457,7 @@ def notes_on_groups(curve: LightCurve, residuals: np.ndarray, alike: float) -> t
 
 
 def ellipsoid_of(solution: Solution) -> Bodies:
-    """The ellipsoid and the motion of a solution, as the model has them."""
+    """The ellipsoid and the motion of a solution, as unknowns of the model."""
     square = np.log(solution.moments.sum() / 2 - solution.moments) / 2
     axes = np.log(solution.axes)
     unknowns = np.r_[
@@ -459,7 +467,7 @@ def ellipsoid_of(solution: Solution) -> Bodies:
 
 
 def bodies_of(solutions: Sequence[Solution], epoch: float, phase: AbstractPhase) -> Bodies:
-    """Bodies of earlier solutions, moved to ``epoch``, with the coefficients of ``phase``."""
+    """Bodies of earlier solutions, propagated to ``epoch``, with coefficients of ``phase``."""
     many, parts = len(phase.typical), []
     for each in solutions:
         unknowns, wxyz = ellipsoid_of(each)
@@ -470,7 +478,7 @@ def bodies_of(solutions: Sequence[Solution], epoch: float, phase: AbstractPhase)
             tuple(jnp.asarray(unknowns[:, k]) for k in (4, 5, 6)),
             jnp.full((1, 1), epoch - each.epoch),
         )
-        assert rates is not None  # neither was declined
+        assert rates is not None  # for the type checker: both are requested
         assert attitude is not None
         unknowns = np.r_[unknowns[0, :4], [float(x[0, 0]) for x in rates], coefficients]
         parts.append(Bodies(unknowns[None], np.array([[float(x[0, 0]) for x in attitude]])))

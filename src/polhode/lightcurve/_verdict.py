@@ -1,4 +1,4 @@
-"""What may be claimed of a light curve: a verdict, its PAR rating, and agreement by resampling."""
+"""The verdict on a light curve, its PAR rating, and the agreement of resampled light curves."""
 
 import enum
 from collections.abc import Sequence
@@ -30,17 +30,18 @@ from polhode.lightcurve._solutions import (
     same_periods,
 )
 
-_DECISIVE = 5.0  # difference of ln Z: odds of 150 to 1
+_DECISIVE = 5.0  # required difference of ln Z: odds of 150 to 1
 _FEW_POINTS = 36  # independent points below which no body of ten parameters is claimed
-_MISFIT = 2.0  # residuals over the curve's own errors from which no solution is certain
-_AGREEMENT = 0.95  # part of the resampled curves in which the best periods must stay the best
+_MISFIT = 2.0  # ratio of residuals to the errors of the points from which no solution is certain
+_AGREEMENT = 0.95  # part of the resampled curves in which the best periods must remain the best
+# Resampled light curves, and the number of nights below which runs of points are resampled instead.
 _RESAMPLED, _BLOCKS = 400, 5
 _ELLIPSOIDS = 4  # rotating ellipsoids that are refined with a convex shape
-_CYCLES = 3.0  # of one period, below which its rating is the lowest
+_CYCLES = 3.0  # observed cycles of a single period below which its PAR rating is 1 instead of 2
 
 
 class Verdict(enum.Enum):
-    """What a light curve shows. Only ``TUMBLING`` claims the periods of the best solution."""
+    """Conclusion from a light curve. Only ``TUMBLING`` claims the periods of the best solution."""
 
     TUMBLING = "tumbling"
     AMBIGUOUS = "ambiguous"
@@ -72,7 +73,7 @@ def null_models(
     series = one_period(linear, end)
     nulls += series
     if series:
-        # the periods of the best series of few and of many harmonics
+        # periods of the two best series, and of the first four (few harmonics)
         best = sorted(series, key=lambda r: float(np.sum((r.values * linear.root) ** 2)))
         periods = dict.fromkeys(round(r.periods[0], 12) for r in (*best[:2], *series[:4]))
         ellipsoids = rotators(linear, list(periods)[:4], end)
@@ -84,9 +85,9 @@ def null_models(
         starts = [e.parameters for e in ellipsoids[:_ELLIPSOIDS]]
         models = compare_models(linear, nulls, effective_correlation)
         series_best = max(models[1 : 1 + len(series)], key=lambda m: m.log_evidence)
-        # without a signal no pole is worth the time
+        # further poles are tried only if a series explains the points better than noise does
         if starts and series_best.log_evidence > models[0].log_evidence:
-            # Few harmonics of one period may be even ones of twice the period.
+            # A series of few harmonics may be the even harmonics of twice its period.
             starts += round_rotators([series_best.periods[0], 2 * series_best.periods[0]])
         points = curve.points(0.0, offset_sigma)
         for start in starts:
@@ -110,16 +111,16 @@ def judge(
     refined: tuple[Solution, ...] = (),
     linearised: Sequence[Linearised] | None = None,
 ) -> Judgement:
-    """Compare the null hypotheses with the best tumbling body, and say what may be claimed.
+    """The verdict, by comparison of the null hypotheses with the best tumbling body.
 
     ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters;
-    ``refined``: what these became with a convex shape, with odds relative to the best solution;
-    ``linearised``: of each solution, for fits to resampled light curves.
+    ``refined``: the same bodies after a fit of a convex shape, with odds relative to the best
+    solution; ``linearised``: models of the solutions, for fits to resampled light curves.
     """
     curve = linear.curve
     best = solutions[0]
     everything = [*nulls, *two_periods(linear, pairs, solutions)]
-    # Evidence counts parameters, which the order of the solutions does not.
+    # The evidence penalises parameters, which the order of the solutions ignores.
     possible = [s for s in solutions[1:] if s.probability > EXCLUDED]
     everything += [tumbler(linear, pairs, body) for body in (best, *others, *possible)]
     models = compare_models(linear, everything, effective_correlation)
@@ -129,13 +130,13 @@ def judge(
         _best_of(models, word) for word in ("noise", "one period", "two periods", "tumbling")
     )
     listed = tuple(m for m in (silent, single, double, body) if m is not None)
-    assert silent is not None  # both are always fitted
+    assert silent is not None  # noise and a tumbling body are always fitted
     assert body is not None
-    # the best of the list, whatever its evidence
+    # the model of ``best``, even if another body has a higher evidence
     own = models[len(models) - 1 - len(others) - len(possible)]
     null = max(m.log_evidence for m in (silent, single) if m is not None)
     two = max(m.log_evidence for m in (double, body) if m is not None)
-    more = two - null  # of two periods over one or none
+    more = two - null  # log-evidence of two periods over one or none
     reasons: list[str] = []
 
     def result(verdict: Verdict, par: int) -> Judgement:
@@ -178,7 +179,7 @@ def judge(
             "A series of two periods explains the points, but no tumbling body that was found does."
         )
     elif double is not None and body.log_evidence - double.log_evidence < _DECISIVE:
-        # which sums of the frequencies its lines are is what only the body can tell
+        # only a body determines which sums of its frequencies the lines of the series are
         reasons.append(
             "No tumbling body explains the points decisively better than a series of two periods:"
             f" ln Z {body.log_evidence - double.log_evidence:+.1f}, {_DECISIVE:g} are needed."
@@ -194,8 +195,8 @@ def judge(
             f"{rivals - 1} other pair(s) of periods cannot be excluded at 1 in"
             f" {round(1 / EXCLUDED)}."
         )
-    # An ellipsoid has too few parameters to follow another body and a convex shape has many, which
-    # can make up for a wrong motion. Where they disagree the shape must be decisive by far.
+    # An ellipsoid has too few parameters for other bodies; a convex shape has many, which can
+    # compensate a wrong motion. Where the two disagree, the convex shape must be far more probable.
     if any(_odds_of(each, solutions, refined, pairs.resolution) > EXCLUDED**2 for each in others):
         reasons.append(
             "The best ellipsoid has other periods or another mode than the best convex body:"
@@ -222,10 +223,11 @@ def _odds_of(
     refined: tuple[Solution, ...],
     resolution: float,
 ) -> float:
-    """Odds of convex bodies with the motion of an ellipsoid, if that is not the best motion; or 0.
+    """Odds of convex bodies with the motion of an ellipsoid; 0 if that is the best motion.
 
-    The list of solutions ends before the odds do. What the ellipsoid became, ``refined``, therefore
-    counts as well, unless its fit ended with the best motion. 1 if nothing is known.
+    The list of solutions is limited and may lack such bodies. ``refined``, the ellipsoid after a
+    fit of a convex shape, therefore counts as well, unless its fit reached the best motion. 1 if
+    there is no such body.
     """
 
     def same_motion(one: Solution, other: Solution) -> bool:
@@ -252,14 +254,14 @@ def bootstrap_agreement(
     linearised: Sequence[Linearised] | None = None,
     count: int = _RESAMPLED,
 ) -> float:
-    """Part of ``count`` resampled light curves in which the best periods stay the best.
+    """Part of ``count`` resampled light curves in which the best periods remain the best.
 
     Nights are drawn with replacement, or runs of points where there are few nights. First the
-    contributions of the points to the cost of every solution are added, without new fits (RELL
+    points' contributions to the cost of every solution are summed, without new fits (RELL
     bootstrap: Kishino, Miyata & Hasegawa, J. Mol. Evol. 31 (1990) 151). With ``linearised`` the
     solutions with odds above 1 in a million are also fitted again to every resampled light curve,
-    by one step of Gauss and Newton from where they are. The smaller part counts. The priors' part
-    of the cost, by which the solutions are ordered too, is the same in all light curves.
+    by one Gauss-Newton step. The smaller of the two parts is returned. The cost of the priors,
+    which the order of the solutions includes, is the same in all light curves.
     """
     if len(set(classes)) < 2:
         return 1.0
@@ -270,7 +272,7 @@ def bootstrap_agreement(
     rng = np.random.default_rng(0)
     weight = rng.multinomial(many, np.full(many, 1 / many), count).astype(float)
     number = np.array(classes)
-    # residuals over the errors that make the best solution fit
+    # residuals over the errors, scaled so that those of the best solution have a deviation of 1
     rest = np.array([(s.model - curve.magnitude) * root for s in solutions])
     rest = rest / _scale_of(rest[0])
     blocks = np.stack([np.bincount(block, c) for c in _robust_cost(rest, limit)])
@@ -280,8 +282,8 @@ def bootstrap_agreement(
         prior = np.array([each.prior_cost for each in linearised]) / scale**2
     cost = blocks @ weight.T + prior[:, None]
     agreement = float(np.mean(number[np.argmin(cost, axis=0)] == number[0]))
-    # Others have often not converged, and the linear model then promises them more than the step
-    # would hold: one with odds of 1e-10 would win in most resampled light curves.
+    # Less probable solutions have often not converged, and the linear model then overestimates the
+    # gain of the step: one with odds of 1e-10 would win in most resampled light curves.
     possible = [k for k, s in enumerate(solutions) if s.probability > EXCLUDED**2]
     if linearised is None or len(set(number[possible])) < 2:
         return agreement
@@ -307,13 +309,13 @@ def _refitted_cost(
     prior, gradient = solution.prior / scale**2, solution.gradient / scale**2
     robust = 1 / np.sqrt(1 + (residuals / limit) ** 2)
     many = weight.shape[1]
-    # The normal equations are sums over blocks: those of a resampled light curve cost a sum of
-    # ``many`` matrices, not another pass over the points.
+    # The normal equations are computed for each block: those of a resampled light curve are then a
+    # weighted sum of ``many`` matrices, not another pass over the points.
     rows = derivatives * robust[:, None]
     parts = [block == k for k in range(many)]
     matrices = np.array([rows[part].T @ derivatives[part] for part in parts])
     rights = np.array([rows[part].T @ residuals[part] for part in parts])
-    # offsets of nights that were not drawn are not determined
+    # the diagonal term keeps the matrix regular: offsets of nights not drawn are undetermined
     size = np.diag(matrices.sum(0) + prior)
     jitter = np.diag(np.where(size > 0, 1e-9 * size, 1.0))
     weight = np.vstack([np.ones(many), weight])
@@ -327,6 +329,6 @@ def _refitted_cost(
     )
     cost = np.einsum("rb,br->r", weight, cost)
     cost += np.einsum("ri,ij,rj->r", step, prior, step) + 2 * step @ gradient
-    # A solution that has not converged would gain by the step with all points as well, as far as
-    # the linear model holds, which was not tried: this gain does not count.
+    # A solution that has not converged would gain by the step with the original weights as well,
+    # but only by the linear model, which was not checked: this gain is subtracted.
     return cost[1:] - cost[0] + _robust_cost(residuals, limit).sum()

@@ -1,6 +1,6 @@
-"""Figures in one call, of a Trajectory or of arrays (the extra ``plot``: matplotlib).
+"""Figures of a Trajectory or of arrays, each in one call (needs the extra ``plot``: matplotlib).
 
-``view``, the page of a moving body, needs no extra.
+``view``, an HTML page with the moving bodies, needs no extra.
 """
 
 from polhode.plot._fits import fit as fit, work_precision as work_precision

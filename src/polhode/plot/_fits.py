@@ -10,22 +10,22 @@ from polhode.fit._numerics import compiled
 from polhode.fit._options import calibrate
 from polhode.plot._samples import ACCENT, AXES, GREY, INK, matrices, new_figure, plain, styled
 
-# chi-square of two degrees of freedom: 68 % and 95 % of a plane
+# quantiles of chi-square with two degrees of freedom
 _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
-# Characters of a name, and rows of a table, that fit into the figure.
+# maximum number of characters of a name, and of rows of a table, in the figure
 _LONGEST, _ROWS = 18, 10
 
 
 @styled
 def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
-    """Figure of a ``fit.Fit`` and its ``fit.Recording``; returns it.
+    """Returns a figure of a ``fit.Fit`` and its ``fit.Recording``.
 
-    Left: rates of the first recording (dots) over the fitted motion (lines), and the residuals in
+    Left: rates of the first recording (dots) and of the fitted motion (lines), and the residuals in
     units of their noise.
-    Right, of an inertia: the region of the two smaller ratios (or moments) that the data allow, and
-    the limit of what a body can be; of a scene: the correlations of the fitted numbers. Below, a
-    table of the results. ``body`` picks one of a batch. Raises ValueError for a recording without
-    rates, or with other leading axes than those of a batch of fits.
+    Right, for an inertia: the confidence region of the two smaller ratios (or moments), and the
+    limit of physical bodies; for a scene: the correlations of the fitted numbers. Below, a table of
+    the results. ``body``: index in a batch. Raises ValueError for a recording without rates, or
+    whose leading axes differ from those of a batch of fits.
     """
     if recording.omega is None:
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
@@ -92,7 +92,7 @@ def _single(result, recording, body) -> dict[str, Any]:
     present, times = (pick(x, 1, place) for x in (recording.present, recording.times))
     present = present > 0
     residual = pick(result.residuals["omega"], 3)[0]
-    # a loss that bounds outliers has shortened their residuals: shown as they were fitted
+    # these residuals are those before the robust loss, so that this is the fitted motion
     model = omega - residual * noise
     hole = np.where(present, 1.0, np.nan)[:, None]
     shared = {
@@ -183,14 +183,14 @@ def _of_values(moments, axes, covariance, scale_known, count) -> np.ndarray:
             for a, b, c in (turn[:, k] for k in range(3))
         ]
     )
-    slope = slope[:, :count]  # a fit of moments only knows no products
+    slope = slope[:, :count]  # without products for ``MomentsOnly``
     if not scale_known:
         slope = (slope - (moments / moments[2])[:, None] * slope[2]) / moments[2]
     return (slope @ covariance[:count, :count] @ slope.T)[:2, :2]
 
 
 def _region(ax, data):
-    """Ellipses of the two smaller values and, for ratios, the edge of what is physical."""
+    """Confidence ellipses of the two smaller values and, for ratios, the unphysical region."""
     value, covariance = data["value"][:2], data["covariance"]
     ax.set_title("What the data allow")
     kind = "moment [kg m²]" if data["scale_known"] else "ratio to the largest moment"
@@ -229,7 +229,7 @@ def _region(ax, data):
 
 
 def _table(ax, data):
-    """The numbers, and remarks in short."""
+    """The results for an inertia, and the findings."""
     ax.set_axis_off()
     head = "moments [kg m²]" if data["scale_known"] else "ratios"
     lines = [f"{'principal ' + head:<28}axis known to"]
@@ -243,7 +243,7 @@ def _table(ax, data):
         f"over the noise {data['chi']:.3g}",
         f"whiteness      p = {data['white']:.2g}",
         "scale          " + ("known" if data["scale_known"] else "not shown by free motion"),
-        "remarks        " + (", ".join(data["findings"]) or "none"),
+        "findings       " + (", ".join(data["findings"]) or "none"),
     ]
     _write_lines(ax, lines)
 
@@ -263,7 +263,7 @@ def _write_lines(ax, lines: list[str]) -> None:
 
 
 def _rounded(value, spread) -> str:
-    """A value with two digits of its spread."""
+    """A value and its standard deviation, to two digits of the latter."""
     if not spread > 0:
         return f"{value:.6g}"
     if not np.isfinite(spread):
@@ -291,8 +291,8 @@ def work_precision(
     """Draw error (down is better) against run time (left is better) per method; returns the Axes.
 
     `curves`: name -> (errors, times), one entry per tolerance or step size. `highlight`: the name
-    of the curve to draw bold. Entries that are not positive and finite are left out, and a curve
-    left with nothing is named in the legend as failed.
+    of the curve to draw bold. Entries that are not positive and finite are left out; a curve
+    without any other is marked as failed in the legend.
     """
     if not isinstance(curves, Mapping):
         raise TypeError(

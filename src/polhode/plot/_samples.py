@@ -1,4 +1,4 @@
-"""What figures share: style, matplotlib, samples as NumPy arrays, units of time and rates."""
+"""Common parts of the figures: style, samples as NumPy arrays, units of time and rates."""
 
 import dataclasses
 import functools
@@ -13,7 +13,7 @@ from polhode._trajectory import Trajectory
 from polhode.inertia import Inertia
 from polhode.rotation._quaternion import matrix_row
 
-X, Y, Z = "#D55E00", "#009E73", "#0072B2"  # body or space axes; told apart by the colour-blind
+X, Y, Z = "#D55E00", "#009E73", "#0072B2"  # body or space axes; safe for colour-blind readers
 AXES = (X, Y, Z)
 INK, GREY, PAPER, ACCENT = "#222222", "#8A8A8A", "#FFFFFF", "#C2185B"
 STYLE = {
@@ -42,7 +42,7 @@ STYLE = {
 
 
 def styled(function):
-    """Run a plotting function with the common look, leaving the user's settings as they are."""
+    """Decorator: run a plotting function with the common style, without changing user settings."""
 
     @functools.wraps(function)
     def wrapper(*args, **kwargs):
@@ -53,7 +53,7 @@ def styled(function):
 
 
 def plain(text: str, length: int = 120) -> str:
-    """A user's text as it stands: `$` begins no formula, control characters are written out."""
+    """A user's text for literal display: `$` and control characters are escaped."""
     from polhode.files._read import escape
 
     text = escape(text)
@@ -62,7 +62,7 @@ def plain(text: str, length: int = 120) -> str:
 
 
 def new_figure(width: float, height: float):
-    """A figure that belongs to pyplot, so that notebooks show it."""
+    """A pyplot figure, which notebooks show automatically."""
     import matplotlib.pyplot as plt
 
     return plt.figure(figsize=(width, height), layout="constrained")
@@ -93,8 +93,8 @@ class Scale(NamedTuple):
 class Samples:
     """Samples of N bodies: ts (N, T), wxyz (N, T, 4), omega_body (N, T, 3), tensor (N, 3, 3).
 
-    `wxyz`, `tensor` and `energy` (N, T) may be None: the plots that need them say so. `momentum`
-    (N, T, 3): that of the body and its wheels, in body axes; None: `tensor` times the rates.
+    `wxyz`, `tensor` and `energy` (N, T) may be None: plots that need them raise ValueError.
+    `momentum` (N, T, 3): body and wheels, in body axes; None: `tensor` times the rates.
     """
 
     ts: np.ndarray
@@ -117,7 +117,7 @@ class Samples:
 
     @property
     def count(self) -> int:
-        """How many bodies."""
+        """Number of bodies."""
         return self.omega_body.shape[0]
 
     @property
@@ -183,14 +183,14 @@ def samples(
 
 
 def as_samples(what: Trajectory | Samples) -> Samples:
-    """The samples of a trajectory, or those given."""
+    """The samples of a trajectory; samples unchanged."""
     if isinstance(what, Samples):
         return what
     if not isinstance(what, Trajectory):
         raise TypeError(
             f"expected a ph.Trajectory or a plot.samples(...), got {type(what).__name__}."
         )
-    inertia = what.scene.inertia  # figures of one that changes with time have no ellipsoid
+    inertia = what.scene.inertia  # a variable inertia has no single ellipsoid to draw
     constant = inertia if isinstance(inertia, Inertia) else None
     result = samples(what.ts, what.omega_body, what._wxyz, constant)
     has_energy = what.scene.potential is None or what._wxyz is not None
@@ -202,7 +202,7 @@ def as_samples(what: Trajectory | Samples) -> Samples:
 
 
 def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:
-    """The samples, and the index of the body to plot (counted over flattened batch axes)."""
+    """The samples, and the index of the body to plot (over flattened batch axes)."""
     result = as_samples(what)
     body = 0 if body is None else body
     if not (isinstance(body, int | np.integer) and -result.count <= body < result.count):
@@ -213,7 +213,7 @@ def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:
 
 
 def box_sides(moments: np.ndarray) -> np.ndarray:
-    """Sides (3,) of the homogeneous box with these moments, drawn with a diagonal of length 1."""
+    """Sides (3,) of the homogeneous box with these moments, scaled to a diagonal of 1."""
     second = np.clip(moments.sum() / 2 - moments, 0, None)
     return np.maximum(np.sqrt(second / second.sum()), 0.02)  # a flat body is a thin plate
 

@@ -36,8 +36,8 @@ def history(
 ) -> Any:
     """Stacked panels of one body: rates, attitude, drifts. Returns the Figure.
 
-    The attitude is shown as the quaternion `wxyz`. The drift is |E/E0 - 1| and |L - L0|/|L0| with L
-    in space axes: rounding and truncation of a free body; where torques act, real change.
+    The attitude is shown as the quaternion `wxyz`. The drifts are |E/E0 - 1| and |L - L0|/|L0| with
+    L in space axes: numerical errors for a torque-free body, physical changes where torques act.
     Panels whose data were not recorded are left out.
     """
     data, body = pick(what, body)
@@ -52,7 +52,7 @@ def history(
     t = data.ts[body] / scale.seconds
     for panel, ax in zip(panels, axes, strict=True):
         panel(ax, t, data, body, scale, axis_names)
-        # beside the panel, where it can hide nothing
+        # beside the panel, where the legend hides no data
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         ax.margins(x=0.01)
     axes[-1].set_xlabel(f"time [{scale.time}]")
@@ -104,10 +104,10 @@ def polhode(
 
     The ellipsoid is that of constant kinetic energy at the first time, in the space of body rates,
     scaled so that its largest semi-axis is 1. Thin lines are polhodes of the same energy for
-    `family` other sizes of the momentum, two curves each, half of them on either side of the
+    `family` other magnitudes of the momentum, two curves each, half of them on either side of the
     separatrix (dashed), which passes through the intermediate axis; 0: none.
     Parts of a curve behind the ellipsoid are faint; a dot marks the first time. `view` is
-    (elevation, azimuth) in degrees; None: towards the curve.
+    (elevation, azimuth) in degrees; None: facing the curve.
     """
     data, body = pick(what, body)
     tensor = data.need("tensor", "the polhode")[body]
@@ -151,7 +151,7 @@ def polhode(
 
 
 def _require_motion(size: float, name: str) -> None:
-    """ValueError for a body of which the energy or momentum ``size`` is zero or not finite."""
+    """ValueError for a body whose energy or momentum ``size`` is zero or not finite."""
     if not np.isfinite(size):
         raise ValueError(
             f"the body did not finish, it has no {name}: its samples at the first time are not"
@@ -176,7 +176,7 @@ def _line(ax, points, facing, **style):
     for front in (False, True):
         visible = points.copy()
         hide = (facing >= 0) != front
-        # keep the neighbours of a change of side, so that the two parts meet
+        # draw the neighbours of a change of side too, so that the two parts join
         hide[1:-1] &= hide[:-2] & hide[2:]
         visible[hide] = np.nan
         alpha = 1.0 if front else 0.22
@@ -212,12 +212,12 @@ def _surface(ax, semi, turn, eye):
 
 
 def _family(moments, twice_energy, count):
-    """Polhodes of the same energy and `count` momenta: closed curves around the first principal
-    axis and, the smaller half of them, around the last one."""
+    """Polhodes of the same energy for `count` magnitudes of the momentum: half of them (rounded up)
+    around the first principal axis, the others around the last one."""
     low, middle, high = moments
     halves = (0, (low, middle), count - count // 2), (2, (middle, high), count // 2)
     for axis, (start, stop), levels in halves:
-        # at equal gaps of the height above the separatrix plane rather than of |L|^2
+        # equidistant in the height above the separatrix instead of in |L|^2
         for fraction in (np.arange(levels) + 0.5) / levels:
             inertia = start + (stop - start) * (fraction**2 if axis == 0 else 1 - fraction**2)
             yield from _level(moments, twice_energy, inertia, axis)
@@ -281,9 +281,9 @@ def herpolhode(
 ) -> Any:
     """Draw the trace of the angular velocity in the invariable plane. Returns the Axes.
 
-    The plane is normal to the angular momentum at the first time, its first direction that of the
-    rates' part in the plane then. Dashed circles are the smallest and the largest distance reached.
-    A dot marks the first time.
+    The plane is normal to the angular momentum at the first time; its first axis is along the
+    projection of the angular velocity at that time. Dashed circles show the smallest and the
+    largest distance from the centre. A dot marks the first time.
     """
     data, body = pick(what, body)
     scale = Scale.of(np.ptp(data.ts[body])) if scale is None else scale
@@ -332,13 +332,13 @@ def overview(
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
     title: str = "",
 ) -> Any:
-    """A figure of the first body, with the spread of the others, and observations.
+    """A figure of the first body, with the distribution of the others, and observations.
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body
-    rates, lines for body 0 and bands from the 5th to the 95th percentile of the others, or thin
-    lines of up to 64 of them where bodies have times of their own; dots are `observed`
+    rates, with lines for body 0 and bands from the 5th to the 95th percentile of the others, or
+    thin lines of up to 64 of them if the bodies have different times; dots are `observed`
     (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or the energy
-    of a body that starts at rest, did not finish, or whose inertia changes with time.
+    of a body that starts at rest, did not finish, or has a variable inertia.
     """
     data = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
@@ -397,14 +397,15 @@ def overview(
 
 
 def _curve(ax, times, values, color, label, is_shared):
-    """Body 0 as a line; three or more bodies as a band, or as lines unless they share the times."""
+    """Body 0 as a line; with three or more bodies the others as a band, or as thin lines if their
+    times differ."""
     t = times[0]
     if len(values) > 2 and not is_shared:
         others = slice(1, 1 + _MOST_BODIES)
         ax.plot(times[others].T, values[others].T, color=color, alpha=0.3, linewidth=0.6, zorder=2)
     elif len(values) > 2:
         with np.errstate(invalid="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # at a time that no clone reached
+            warnings.simplefilter("ignore", RuntimeWarning)  # of times that no clone reached
             low, high = np.nanpercentile(values[1:], _BAND, axis=0)
         ax.fill_between(t, low, high, color=color, alpha=0.22, linewidth=0, zorder=2)
     ax.plot(t, values[0], color=color, label=label, linewidth=1.3, zorder=3)
@@ -424,7 +425,7 @@ def _dots(ax, t, values, color):
 
 
 def _key(ax, observed, clones, is_shared):
-    """What lines, bands and dots mean."""
+    """The legend of lines, bands and dots."""
     from matplotlib.artist import Artist
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -460,13 +461,13 @@ def animate(
     dpi: int = 100,
     scale: Scale | None = None,
 ) -> Any:
-    """Animate bodies as the boxes of the same inertia; returns matplotlib's `FuncAnimation`.
+    """Animate bodies as boxes with the same inertia; returns matplotlib's `FuncAnimation`.
 
     Every body is drawn as the homogeneous box with its moments, each in its own panel (up to 64
-    bodies; `bodies` picks some). The motion from first to last time is shown in `seconds`, with
-    attitudes interpolated between samples. `path` ending in .gif, .mp4 or .html writes a file,
-    whole or not at all: gif needs pillow, mp4 the program ffmpeg. Raises ValueError for another
-    ending, RuntimeError when the writer is missing.
+    bodies; `bodies` selects them). The motion from first to last time is shown in `seconds`, with
+    attitudes interpolated between samples. `path` ending in .gif, .mp4 or .html: the file to write,
+    atomically; gif needs pillow, mp4 the program ffmpeg. Raises ValueError for another ending,
+    RuntimeError if the writer is missing.
     """
     from matplotlib.animation import FuncAnimation
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -511,7 +512,7 @@ def animate(
 
     draw(0)
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # laid out once, not in every frame
+    figure.set_layout_engine("none")  # the layout is computed once, not in every frame
     animation = FuncAnimation(figure, draw, frames=frames, interval=1000 / fps, blit=False)
     if path is not None:
         _save(animation, Path(path), fps, dpi)
@@ -538,7 +539,7 @@ def _shade(turn: np.ndarray, corners: np.ndarray) -> np.ndarray:
         # the hue of the body axis nearest to the face's normal
         axis = int(np.argmax(np.abs(centre)))
         hue = np.array(to_rgb(AXES[axis]))
-        if centre[axis] < 0:  # a body that has turned over must look different
+        if centre[axis] < 0:  # so that an inverted body looks different
             hue = 0.35 * hue + 0.65
         colors.append(np.clip(hue * 0.55 + 0.25 + 0.25 * (normal @ light), 0, 1))
     return np.array(colors)
@@ -546,7 +547,7 @@ def _shade(turn: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 def _interpolate(times, ts, wxyz):
     """Rotation matrices at `times`, by normalised linear interpolation between samples."""
-    # neighbouring quaternions on the same side, so that the short way is taken
+    # signs that make neighbouring quaternions close, for the shorter rotation between them
     flips = np.sign(np.sum(wxyz[1:] * wxyz[:-1], axis=-1))
     flips = np.concatenate([[1.0], np.cumprod(np.where(flips == 0, 1.0, flips))])
     continuous = wxyz * flips[:, None]

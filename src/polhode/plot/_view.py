@@ -1,4 +1,4 @@
-"""A page that shows moving bodies: one HTML file, drawn by three.js, which needs no network."""
+"""An HTML page with moving bodies: a single file, rendered by three.js, that works offline."""
 
 import base64
 import dataclasses
@@ -24,18 +24,19 @@ from polhode.plot._samples import Samples, Scale, as_samples, box_sides, matrice
 from polhode.rotation import matrix_to_wxyz
 
 MOST_SAMPLES = 20_000
-"""Samples of all shown bodies together that a page holds; more are thinned."""
+"""Maximum number of samples in a page, over all bodies; of more samples every k-th is taken."""
 
 QUARTER = np.pi / 2
-"""Largest turn [rad] between samples across which a page interpolates."""
+"""Largest rotation [rad] between samples for which a page interpolates attitudes."""
 
 _MOST_BODIES = 12
-_COLORS = ("#f0803c", "#2fbf8f", "#4a97e8")  # of the faces of a box, by body axis
+_COLORS = ("#f0803c", "#2fbf8f", "#4a97e8")  # faces of a box, by body axis
 
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """One body in the order of time: ts (T,), wxyz, omega_body, momentum (T, 3) in space."""
+    """Samples of one body, by increasing time: ts (T,), wxyz (T, 4), omega_body (T, 3), momentum
+    (T, 3) in space, and its tensor (3, 3)."""
 
     ts: np.ndarray
     wxyz: np.ndarray
@@ -45,26 +46,26 @@ class Body:
 
     @classmethod
     def sorted(cls, ts, wxyz, omega_body, momentum, tensor) -> "Body":
-        """The body with its samples in the order of time, which may run backwards."""
+        """The body with its samples sorted by time, which may decrease in the arguments."""
         order = np.argsort(ts)
         return cls(ts[order], wxyz[order], omega_body[order], momentum[order], tensor)
 
     @property
     def free(self) -> bool:
-        """Whether momentum in space stays, and is that of the body alone (no wheels).
+        """Whether the momentum in space is constant and that of the body alone (no wheels).
 
-        To a thousandth, which no eye can tell.
+        The tolerance is a thousandth, which is not visible in a page.
         """
         body_momentum = np.einsum(
             "tij,jk,tk->ti", matrices(self.wxyz), self.tensor, self.omega_body
         )
         size = np.linalg.norm(self.momentum, axis=-1).max()
-        steady = np.ptp(self.momentum, axis=0) <= 1e-3 * size
-        return bool(steady.all() and (np.abs(body_momentum - self.momentum) <= 1e-3 * size).all())
+        constant = np.ptp(self.momentum, axis=0) <= 1e-3 * size
+        return bool(constant.all() and (np.abs(body_momentum - self.momentum) <= 1e-3 * size).all())
 
 
 def chosen_bodies(what: Any, bodies: Sequence[int] | None) -> list[Body]:
-    """The bodies to show, by number, of one motion or of several."""
+    """The bodies of one motion or of several that have these numbers."""
     several = what if isinstance(what, Sequence) else [what]
     candidates: list[Body] = []
     for one in several:
@@ -106,7 +107,7 @@ def per_body(mesh: Any, count: int) -> list[Any]:
 
 
 def drawing_of(body: Body, start: float, max_samples: int, mesh: Any) -> dict[str, Any]:
-    """What the page knows of one body."""
+    """The data of one body for the page."""
     step = max(1, -(-(len(body.ts) - 1) // (max_samples - 1)))
     rows = np.unique(np.append(np.arange(0, len(body.ts), step), len(body.ts) - 1))
     moments, turn = np.linalg.eigh(body.tensor)
@@ -145,7 +146,8 @@ def _solid(vertices, faces, colors) -> dict[str, Any]:
 
 
 def _box(moments: np.ndarray, turn: np.ndarray) -> dict[str, Any]:
-    """The homogeneous box with these moments; a hue for each body axis, paler on its far side."""
+    """The homogeneous box with these moments; a colour for each body axis, paler on the negative
+    side."""
     half = box_sides(moments)
     vertices, colors, faces = [], [], []
     for axis in range(3):
@@ -164,7 +166,7 @@ def _box(moments: np.ndarray, turn: np.ndarray) -> dict[str, Any]:
 
 
 def _linear(color: str) -> np.ndarray:
-    """Linear light (3,) of a colour such as "#2fbf8f", which is what a renderer adds up."""
+    """Linear intensities (3,), which a renderer uses, of a colour such as "#2fbf8f"."""
     return (np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255) ** 2.2
 
 
@@ -185,7 +187,7 @@ def _mesh(mesh: Any) -> dict[str, Any]:
 
 
 def camera(momenta: list[np.ndarray]) -> tuple[list[float], list[float]]:
-    """The way up, and that to the eye: up is the momentum that all share, else space z."""
+    """Directions up and to the camera. Up is the common direction of the momenta, or space z."""
     up = np.array([0.0, 0.0, 1.0])
     units = [m[0] / n for m in momenta if (n := np.linalg.norm(m[0])) > 0]
     if units and min(unit @ units[0] for unit in units) > 0.99:
@@ -198,7 +200,7 @@ def camera(momenta: list[np.ndarray]) -> tuple[list[float], list[float]]:
 
 
 def note(several: list[dict[str, Any]]) -> str:
-    """What the reader of the page has to know about what is shown."""
+    """A note for the page on samples that are left out or not interpolated."""
     notes = []
     step = max(body["step"] for body in several)
     if step > 1:
@@ -231,13 +233,15 @@ def read(path: str | os.PathLike) -> tuple[list[Body], str]:
         ts = np.asarray(data["time" if "time" in data.coords else "ts"], np.float64)
         text, title = data.attrs["scene"], str(data.attrs.get("title", ""))
     if has_body_axis and moments.ndim > 1:
-        tensors = moments[:, :, None] * np.eye(3)  # clones differ in moments about the body axes
+        # clones with different moments, which are principal moments along the body axes
+        tensors = moments[:, :, None] * np.eye(3)
     else:
         scene = parse_scene(text, path, files=False)
-        if scene.inertia.table is not None:  # else what drives the body is no part of the picture
+        # of the files that a scene names, only those of a variable inertia are needed
+        if scene.inertia.table is not None:
             scene = parse_scene(text, path)
         inertia = build_inertia(scene, jnp.result_type(float))
-        # one that changes with time is drawn as it is at the first time
+        # a variable inertia is drawn as it is at the first time
         tensors = np.asarray(inertia_at(inertia, ts.flat[0]).tensor, np.float64)
     count = wxyz.shape[0] if has_body_axis else 1
     ts = np.broadcast_to(ts, (count, ts.shape[-1]))
@@ -247,7 +251,7 @@ def read(path: str | os.PathLike) -> tuple[list[Body], str]:
 
 
 def _require_hdf5(path: Path) -> None:
-    """Check that the path is a file in the format of NetCDF-4, which is HDF5.
+    """Check that the path is an HDF5 file, the format of NetCDF-4.
 
     Raises FileNotFoundError for a missing file, ValueError for a folder and for other formats.
     """
@@ -264,7 +268,7 @@ def _require_hdf5(path: Path) -> None:
 
 
 def _require_content(path: str | os.PathLike) -> None:
-    """Check that the variables are there, before xarray guesses what another file means."""
+    """Check that the file contains the variables, because xarray's own errors are less clear."""
     h5py = imported("reading NetCDF", "h5py")
     try:
         with h5py.File(path, "r") as file:
@@ -277,25 +281,25 @@ def _require_content(path: str | os.PathLike) -> None:
         raise ValueError(f"{path} lacks {', '.join(missing)}: {_EXPECTED}.")
 
 
-_SHOWN_TURNS = 0.4  # turns that the fastest body makes in a second of the page
+_SHOWN_TURNS = 0.4  # revolutions of the fastest body per second of playback
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A page, as text: notebooks show it; ``write(path)`` makes a file, ``open(path)`` shows it."""
+    """An HTML page. Notebooks display it; ``write(path)`` saves it, ``open(path)`` shows it too."""
 
     html: str
     height: int = 560
 
     def write(self, path: str | os.PathLike) -> Path:
-        """Write the page, whole or not at all; returns the path."""
+        """Write the page atomically; returns the path."""
         path = Path(path)
         with atomic_write(path) as temporary:
             temporary.write_text(self.html, encoding="utf-8")
         return path
 
     def open(self, path: str | os.PathLike) -> bool:
-        """Write the page and show it in the user's web browser; whether there is one."""
+        """Write the page and open it in the web browser; returns whether there is one."""
         return webbrowser.open(self.write(path).resolve().as_uri())
 
     def _repr_html_(self) -> str:
@@ -325,25 +329,26 @@ def view(
 
     **Arguments:**
 
-    - ``what``: a trajectory, a ``plot.samples``, or a list of them, whose bodies (batch axes
-      flattened) stand side by side, 12 at most; ``bodies`` picks some by number.
-    - ``path``: the file to write, or None. The page needs nothing but the file: no network.
-    - ``mesh``: the body's surface in body axes, its origin the point about which the body rotates:
-      a pair (vertices (v, 3), faces (f, 3)), a ``trimesh.Trimesh``, the path of a mesh file, or a
-      list of one for each body. None: the homogeneous box with the same inertia. It is drawn to fit
-      the picture, whatever its size.
+    - ``what``: a trajectory, a ``plot.samples``, or a list of them. Their bodies (batch axes
+      flattened), 12 at most, are shown side by side; ``bodies`` selects some by number.
+    - ``path``: the file to write, or None. The page needs no other file and no network.
+    - ``mesh``: the body's surface in body axes, with the origin at the point about which the body
+      rotates: a pair (vertices (v, 3), faces (f, 3)), a ``trimesh.Trimesh``, the path of a mesh
+      file, or a list with one of these for each body. None: the homogeneous box with the same
+      inertia. It is scaled to fit the picture.
     - ``names``, ``axis_names``, ``title``: of the bodies, of the body axes, of the page.
-    - ``seconds``: time of the page that the whole motion takes; None: the fastest body makes 0.4
-      revolutions per second.
-    - ``scale``: units of time and rate that are shown; None: those that suit the duration.
+    - ``seconds``: playback time of the whole motion; None: the fastest body makes 0.4 revolutions
+      per second.
+    - ``scale``: units of time and rate in the page; None: units that suit the duration.
 
-    Numbers are kept in single precision. Of bodies with more than 20,000 samples together, every
-    k-th and the last are kept, k the least that suffices. Between samples attitudes are
-    interpolated, unless a body rotates by more than a quarter revolution from one sample to the
-    next: then the page shows samples only, and says so. ``page.html#t=12.5`` opens at that time.
+    Numbers are stored in single precision. If the bodies have more than 20,000 samples in total,
+    the page contains only every k-th and the last one, with the smallest sufficient k. Attitudes
+    are interpolated between samples, unless a body rotates by more than a quarter revolution from
+    one sample to the next: then the page shows samples only, with a note. ``page.html#t=12.5``
+    opens at that time.
 
-    Raises ValueError for too many bodies or times, meshes and names that do not fit them, and for
-    a motion that is not finite; TypeError for other kinds of input.
+    Raises ValueError for too many bodies, fewer than two times, meshes and names that do not fit
+    the bodies, and for a motion that is not finite; TypeError for other kinds of input.
     """
     bodies_drawn = chosen_bodies(what, bodies)
     start = min(float(one.ts[0]) for one in bodies_drawn)
@@ -405,10 +410,10 @@ def view_file(
     """The page of a NetCDF file that ``polhode run`` wrote.
 
     ``output``: the HTML file to write, or None. ``bodies``: clones by number; None: the first
-    three. Other ``options`` are those of ``view``; the title is that of the file. Moments and axes
-    of the body are those of the scene file, whose text the NetCDF file holds. Raises ImportError
-    without xarray and h5netcdf, FileNotFoundError without the file, ValueError for a file that
-    lacks what is shown.
+    three. Other ``options`` are those of ``view``; the default title is that of the file. Moments
+    and axes of the body are those of the scene file, whose text the NetCDF file contains. Raises
+    ImportError without xarray and h5netcdf, FileNotFoundError for a missing file, ValueError for a
+    file without the required variables.
     """
     if not isinstance(path, str | os.PathLike):
         raise TypeError(
@@ -427,7 +432,7 @@ def _page(title: str, motion: dict[str, Any]) -> str:
     folder = files("polhode.plot") / "viewer"
     names = ("page.html", "viewer.js", "three.min.js", "three.LICENSE.txt")
     text = {name: (folder / name).read_text(encoding="utf-8") for name in names}
-    # "</" would end the script that holds the numbers
+    # "</" would end the script element that contains the numbers
     packed = json.dumps(motion, allow_nan=False).replace("<", "\\u003c")
     return Template(text["page.html"]).substitute(
         title=html.escape(title),

@@ -5,12 +5,12 @@ axis and angle are those of docs/equations.md, 002. Modified Rodrigues parameter
 ``p = axis tan(angle/4)``: two sets describe each rotation, one for each sign of the quaternion, one
 of length at most 1 (angle up to pi) and its shadow ``-p/|p|**2`` (Schaub and Junkins 1996).
 
-Of Euler angles, ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md; the
-other 23 sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
-All angles are in rad. ``sequence``, by default ZYZ, is a ``Sequence`` or its axes as SciPy writes
-them: ``"ZYX"`` about body axes, ``"zyx"`` about space axes. Every conversion passes through the
-unit quaternion, the only description that is smooth and well scaled everywhere: small rotations
-keep their relative accuracy, half turns their axis.
+For Euler angles docs/equations.md uses ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``; the other 23
+sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022). All
+angles are in rad. ``sequence``, by default ZYZ, is a ``Sequence`` or its axes in SciPy's notation:
+``"ZYX"`` about body axes, ``"zyx"`` about space axes. Every conversion goes through the unit
+quaternion, the only description that is smooth and well scaled everywhere: small rotations retain
+their relative accuracy, half turns their axis.
 """
 
 import enum
@@ -40,12 +40,12 @@ from polhode.rotation._quaternion import (
 def wxyz_to_matrix(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3 3"]:
     """Rotation matrix of a unit quaternion; either sign of the quaternion gives the same matrix.
 
-    Raises ValueError for a quaternion that is known not to be of unit length.
+    Raises ValueError for a concrete quaternion that is not of unit length.
     """
     return _matrix(as_quaternions(wxyz, unit=True))
 
 
-@jax.jit  # one program, not one for each operation
+@jax.jit  # outside jit too, one program for all operations
 def _matrix(wxyz: Array) -> Array:
     q = jnp.unstack(wxyz, axis=-1)
     return jnp.stack([jnp.stack(matrix_row(q, i), axis=-1) for i in range(3)], axis=-2)
@@ -59,8 +59,8 @@ def matrix_to_wxyz(matrix: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 4"]:
     cancellation for every rotation, angles of pi included (after Shepperd 1978). The derivative is
     the one for changes that keep the matrix a rotation.
 
-    Raises ValueError for a matrix that is no rotation (a reflection, a scaling, entries off by more
-    than 1e-3); while it is traced the quaternion of such a one is NaN.
+    Raises ValueError for a matrix that is not a rotation (a reflection, a scaling, errors above
+    1e-3); for a traced one the quaternion is NaN.
     """
     return _quaternion_of_matrix(*as_matrices(matrix))
 
@@ -87,7 +87,7 @@ def _quaternion_of_matrix(matrix: Array, good: Array) -> Array:
 def rotation_vector_to_wxyz(rotation_vector: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion of a rotation vector (rad), smooth everywhere.
 
-    NaN where the square of the vector overflows: its rounding error is many turns.
+    NaN where the square of the vector overflows; its rounding error then exceeds many turns.
     """
     return _turned_by(as_vectors("rotation_vector", rotation_vector, 3))
 
@@ -102,8 +102,8 @@ def _turned_by(rotation_vector: Array) -> Array:
 def wxyz_to_rotation_vector(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
     """Rotation vector (rad) of length at most pi of a quaternion (its scale does not matter).
 
-    Smooth at the identity, with right derivatives of every order; at an angle of pi, where it jumps
-    between two opposite vectors, its derivative is one-sided.
+    Smooth at the identity, with correct derivatives of every order; at an angle of pi, where it
+    jumps between two opposite vectors, its derivative is one-sided.
     """
     return _rotation_vector(as_quaternions(wxyz))
 
@@ -119,7 +119,7 @@ def axis_angle_to_wxyz(
 ) -> Float[Array, "*b 4"]:
     """Unit quaternion of the rotation by ``angle`` (rad) about the unit vector ``axis``.
 
-    Raises ValueError for an axis that is known not to be of unit length.
+    Raises ValueError for a concrete axis that is not of unit length.
     """
     as_axes("axis", axis)
     axis, angle = as_floats(finite=False, axis=(axis, (3,)), angle=(angle, ()))
@@ -132,9 +132,9 @@ def wxyz_to_axis_angle(
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
     """Unit axis and angle in [0, pi] (rad) of a quaternion (its scale does not matter).
 
-    At the identity the axis is undefined and (0, 0, 1) is returned. There neither axis nor angle
-    has a derivative, and zero is returned for it; `wxyz_to_rotation_vector` is smooth there.
-    Raises ValueError for a quaternion that is zero; of a traced one axis and angle are NaN.
+    At the identity the axis is undefined and (0, 0, 1) is returned. Neither axis nor angle has a
+    derivative there, and zero is returned for it; `wxyz_to_rotation_vector` is smooth there.
+    Raises ValueError for a zero quaternion; axis and angle of a traced one are NaN.
     """
     return _axis_angle(as_quaternions(wxyz))
 
@@ -147,23 +147,23 @@ def _axis_angle(wxyz: Array) -> tuple[Array, Array]:
 
 
 def _nan_if_zero(wxyz: Array) -> Array:
-    """The quaternions, with NaN for those that are zero and describe no rotation."""
+    """The quaternions, with NaN in place of zero ones, which describe no rotation."""
     return jnp.where(jnp.any(wxyz != 0, axis=-1, keepdims=True), wxyz, jnp.nan)
 
 
 def modified_rodrigues_to_wxyz(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion of modified Rodrigues parameters of any length.
 
-    The scalar part is negative for parameters longer than 1, so that each set is given back by
-    `wxyz_to_modified_rodrigues` or `wxyz_to_shadow` respectively.
+    The scalar part is negative for parameters longer than 1. `wxyz_to_modified_rodrigues` returns
+    parameters of length up to 1, `wxyz_to_shadow` longer ones.
     """
     return _of_modified_rodrigues(as_vectors("parameters", parameters, 3))
 
 
 @jax.jit
 def _of_modified_rodrigues(parameters: Array) -> Array:
-    # Both terms are scaled alike, which cannot change the quotient: no overflow for huge
-    # parameters, and the derivative of the scale may be left out.
+    # A common scale, which cancels in the quotient, avoids overflow for huge parameters. Its
+    # derivative may be omitted.
     largest = jnp.max(jnp.abs(parameters), axis=-1, keepdims=True)
     scale = jax.lax.stop_gradient(jnp.maximum(largest, jnp.ones_like(largest)))
     one, scaled = 1 / scale, parameters / scale
@@ -208,7 +208,7 @@ def _shadow(wxyz: Array) -> Array:
 def shadow(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 3"]:
     """The other set of the same rotation, ``-p/|p|**2``.
 
-    NaN for the identity: its other set is infinite, and of no direction.
+    NaN for the identity, whose other set is infinite with an undefined direction.
     """
     parameters = as_vectors("parameters", parameters, 3)
     size = length(parameters)[..., None]
@@ -254,10 +254,10 @@ class Sequence(enum.Enum):
 
     @classmethod
     def of(cls, axes: str) -> "Sequence":
-        """The sequence that SciPy writes so: ``"ZYX"`` intrinsic, ``"zyx"`` extrinsic.
+        """The sequence in SciPy's notation: ``"ZYX"`` intrinsic, ``"zyx"`` extrinsic.
 
-        Raises TypeError for what is no string, ValueError for anything but three letters of one
-        case, neighbours different.
+        Raises TypeError unless ``axes`` is a string, ValueError unless it has three letters of one
+        case, with different neighbours.
         """
         if not isinstance(axes, str):
             raise TypeError(
@@ -288,7 +288,7 @@ class Sequence(enum.Enum):
 
 
 def as_sequence(sequence: Any) -> Sequence:
-    """A ``Sequence``, also from the letters that SciPy writes; TypeError for anything else."""
+    """A ``Sequence``, also from letters in SciPy's notation; TypeError for anything else."""
     if isinstance(sequence, str):
         return Sequence.of(sequence)
     if not isinstance(sequence, Sequence):
@@ -304,10 +304,11 @@ def _parity(i: int, j: int, k: int) -> int:
 
 
 def _half_sum(left: Array, right: Array) -> tuple[Array, Array]:
-    """Cosine and sine of (left + right)/2 for the exact sum, not only for the rounded one.
+    """Cosine and sine of (left + right)/2 for the exact sum instead of the rounded one.
 
-    Near |left + right| = 2 pi the rounding of the sum alone would spoil a small rotation. The
-    rounding error is found exactly (Knuth 1969), and does not depend on the angles smoothly.
+    Near |left + right| = 2 pi the rounding error of the sum would be large compared with a small
+    rotation. It is computed exactly (two-sum, Knuth 1969); as it is not a smooth function of the
+    angles, its derivative is stopped.
     """
     total = left + right
     right_part = total - left
@@ -324,11 +325,12 @@ def euler_to_wxyz(
 ) -> Float[Array, "*b 4"]:
     """Unit quaternion of Euler angles (rad), smooth for all angles.
 
-    The angles are given in the order of the sequence's axes; ``sequence``: a ``Sequence``, or its
-    axes as SciPy writes them, ``"ZYX"`` about body axes, ``"zyx"`` about space axes. The sign of
-    the quaternion follows the angles continuously; `canonical` picks the one with scalar part >= 0.
+    The angles are in the order of the sequence's axes; ``sequence``: a ``Sequence``, or its axes in
+    SciPy's notation, ``"ZYX"`` about body axes, ``"zyx"`` about space axes. The sign of the
+    quaternion depends continuously on the angles; `canonical` returns the one with scalar part
+    >= 0.
 
-    Raises ValueError for letters that are no sequence, TypeError for anything else.
+    Raises ValueError for letters that are not a sequence, TypeError for other kinds.
     """
     return _quaternion(
         as_sequence(sequence),
@@ -336,7 +338,7 @@ def euler_to_wxyz(
     )
 
 
-@partial(jax.jit, static_argnums=0)  # one program, not one for each operation
+@partial(jax.jit, static_argnums=0)  # outside jit too, one program for all operations
 def _quaternion(sequence: Sequence, first: Array, second: Array, third: Array) -> Array:
     i, j, k = sequence.axes
     if sequence.is_extrinsic:
@@ -382,13 +384,13 @@ def wxyz_to_euler(
     """Euler angles (rad) of a quaternion (its scale and its sign do not matter).
 
     First and third angle lie in [-pi, pi]; the second in [0, pi] (same first and last axis) or
-    [-pi/2, pi/2]. Where the second angle reaches an end of its range only the sum or the difference
-    of the other two is defined, and it is shared equally between them; derivatives of the angles
-    do not exist there, and the missing parts are returned as zero. ``sequence`` as for
+    [-pi/2, pi/2]. At the ends of the range of the second angle only the sum or the difference of
+    the other two is defined, and it is divided equally between them; derivatives of the angles do
+    not exist there, and the missing parts are returned as zero. ``sequence`` as for
     `euler_to_wxyz`.
 
-    Raises ValueError for a quaternion that is zero, or as `euler_to_wxyz` for a ``sequence``; the
-    angles of a traced quaternion that is zero are NaN.
+    Raises ValueError for a zero quaternion, and as `euler_to_wxyz` for a ``sequence``; the angles
+    of a traced quaternion that is zero are NaN.
     """
     return _angles(as_sequence(sequence), as_quaternions(wxyz))
 
@@ -396,9 +398,10 @@ def wxyz_to_euler(
 @partial(jax.jit, static_argnums=0)
 def _angles(sequence: Sequence, wxyz: Array) -> tuple[Array, Array, Array]:
     wxyz = _nan_if_zero(wxyz)
-    # Products of components of tiny or huge quaternions would underflow or overflow. The scale does
-    # not matter, so that its derivative may be left out. It is a power of two: where the second
-    # angle is near an end of its range, rounded components would change the other two.
+    # Without scaling, products of components of tiny or huge quaternions would underflow or
+    # overflow. The scale cancels, so that its derivative may be omitted. It is a power of two,
+    # because near an end of the range of the second angle rounded components would change the
+    # other two.
     size = jax.lax.stop_gradient(largest(wxyz))
     wxyz = wxyz / (size / jnp.frexp(size)[0])
     i, j, k = sequence.axes
@@ -411,13 +414,13 @@ def _angles(sequence: Sequence, wxyz: Array) -> tuple[Array, Array, Array]:
     if sequence.is_proper:
         sums, differences = (w, along_i), (along_j, along_k)
     else:
-        # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is
+        # R_i(a) R_j(b) R_k(c) followed by a quarter turn about body axis j is
         # R_i(a) R_j(b + pi/2) R_i(-parity c).
         sums = (w - along_j, along_i - along_k)
         differences = (w + along_j, along_i + along_k)
     sum_size, sum_cos, sum_sin = _phase(*sums)
     difference_size, difference_cos, difference_sin = _phase(*differences)
-    # arguments of the products U V and U conj(V): one arctangent each, already within (-pi, pi]
+    # arguments of the products U V and U conj(V), by one arctangent each, within (-pi, pi]
     first = jnp.arctan2(
         sum_cos * difference_sin + sum_sin * difference_cos,
         sum_cos * difference_cos - sum_sin * difference_sin,
@@ -480,9 +483,9 @@ def euler_to_axis_angle(
     psi: Float[ArrayLike, "*#b"],
     sequence: Sequence | str = Sequence.ZYZ,
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
-    """Unit axis and angle in [0, pi] of Euler angles: robust (docs/equations.md, 002: 3-12).
+    """Unit axis (l, m, n) and angle in [0, pi] of Euler angles (docs/equations.md, 002: 3-12).
 
-    For ZYZ the axis is that of R; the matrix K rotates about ``(l, -m, -n)``.
+    For ZYZ they are those of R; the matrix K of docs/equations.md rotates about ``(l, -m, -n)``.
     """
     return wxyz_to_axis_angle(euler_to_wxyz(phi, theta, psi, sequence))
 
@@ -516,7 +519,7 @@ def modified_rodrigues_to_euler(
 def euler_to_matrix_k(
     phi: Float[ArrayLike, "*#b"], theta: Float[ArrayLike, "*#b"], psi: Float[ArrayLike, "*#b"]
 ) -> Float[Array, "*b 3 3"]:
-    """The matrix K (docs/equations.md, 002): R of the same ZYZ angles, y and z axes reversed.
+    """The matrix K (docs/equations.md, 002): R of the same ZYZ angles with reversed y and z axes.
 
     ``K(phi, theta, psi) = D R D = R(-phi, -theta, -psi) = R(psi, theta, phi)^T``, with
     ``D = diag(1, -1, -1)``. K is neither R nor its transpose.

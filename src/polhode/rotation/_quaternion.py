@@ -1,13 +1,13 @@
 """Unit quaternions, scalar first (``wxyz``), that rotate body components into space components.
 
 Every function takes arrays of shape (..., 4) (quaternions) and (..., 3) (vectors), broadcasts
-leading axes together, and keeps the dtype of its input. The matrix and the rate of a quaternion are
-written once, on component arrays. Scalar-last quaternions and SciPy's ``Rotation`` are converted
-here.
+leading axes together, and preserves the dtype of its input. The matrix and the rate of a quaternion
+are implemented once, for component arrays. Conversions of scalar-last quaternions and of SciPy's
+``Rotation`` are here as well.
 
-Shapes of arguments are always checked, values where they are concrete. Under ``jit``, ``vmap`` and
-``grad`` no error can be raised: a matrix that is no rotation becomes NaN, and a quaternion that is
-not of unit length is used as it is.
+Shapes of arguments are always checked, values only if they are concrete. Under ``jit``, ``vmap``
+and ``grad`` no error can be raised: a matrix that is not a rotation becomes NaN, and a quaternion
+that is not of unit length is used unchanged.
 """
 
 import math
@@ -35,16 +35,16 @@ from polhode._checks import (
 )
 from polhode._kernels import smooth
 
-# Scalar functions that every conversion rests on, smooth where the mathematics is smooth. A square
-# root, a quotient 0/0 or an arctangent of two zeros has a value but no usable derivative under
-# automatic differentiation. Here each such function carries its analytic derivative, written with
-# functions that are themselves smooth, so that second derivatives are right as well.
+# Scalar functions of the conversions, differentiable wherever the exact functions are. Automatic
+# differentiation fails at a square root of zero, a quotient 0/0 or an arctangent of two zeros. Each
+# function here has its analytic derivative, which is written with functions that are smooth
+# themselves, so that second derivatives are correct as well.
 
 
 @smooth
 def largest(vector: Array) -> Array:
-    """Largest absolute component (..., 1): a scale that cancels in what is computed with it, so
-    that its changes from one component to another are no kinks."""
+    """Largest absolute component (..., 1). It is used only as a scale that cancels, so that results
+    are smooth although the largest component changes."""
     return jnp.max(jnp.abs(vector), axis=-1, keepdims=True)
 
 
@@ -56,7 +56,7 @@ def _dot(left: Array, right: Array) -> Array:
 def length(vector: Float[Array, "*b n"]) -> Float[Array, "*b"]:
     """Euclidean length over the last axis, without overflow or underflow.
 
-    Its derivative at the zero vector, where none exists, is taken as zero.
+    Its derivative at the zero vector, where none exists, is returned as zero.
     """
     scale = largest(vector)[..., 0]
     safe = jnp.where(scale > 0, scale, jnp.ones_like(scale))
@@ -84,8 +84,8 @@ def _length_jvp(primals, tangents):
 
 @direction.defjvp
 def _direction_jvp(primals, tangents):
-    # Written with 1/length once: the general rule of a quotient would form 1/length**2,
-    # which overflows for vectors of 1e-200.
+    # Contains only 1/length: the quotient rule of automatic differentiation would form
+    # 1/length**2, which overflows for vectors of 1e-200.
     (vector,), (tangent,) = primals, tangents
     unit = direction(vector)
     size = length(vector)[..., None]
@@ -97,8 +97,9 @@ def _direction_jvp(primals, tangents):
 
 # --- sin(a)/a as a function of a**2 --------------------------------------------------------------
 
-# Beyond a**2 = 4 the closed form of (a - sin a)/a**3 loses less than a factor two; below, the
-# power series (3 + 2 j)!, j = 0 .. 12 has converged together with its second derivative.
+# Above a**2 = 4 cancellation in the closed form of (a - sin a)/a**3 loses less than a factor of
+# two in accuracy; below, the power series with the terms j = 0 .. 12 has converged, as has its
+# second derivative.
 _SERIES_BELOW = 4.0
 _CUBIC_SERIES = tuple((-1) ** j / math.factorial(2 * j + 3) for j in range(13))
 
@@ -146,8 +147,8 @@ def _cosine_jvp(primals, tangents):
 # --- half angle of a quaternion over the length of its vector part -------------------------------
 
 # h(c) = (c s - A)/(2 s**3) with c = cos A, s = sin A, on 0 <= c <= 1, where it is analytic: the
-# Chebyshev interpolant of degree 25 in x = 2 c - 1, written in powers of x. Its error is 6e-20, so
-# that its first two derivatives are exact to rounding too; one formula serves the whole range.
+# Chebyshev interpolant of degree 25 in x = 2 c - 1, in powers of x, for the whole range. Its error
+# is 6e-20, so that its first two derivatives are also accurate to rounding error.
 _ARC_SLOPE = (
     -0.47279971743743015587,
     0.19386694922923651107,
@@ -197,21 +198,22 @@ def _arc_ratio_jvp(primals, tangents):
     (scalar, vector), (scalar_tangent, vector_tangent) = primals, tangents
     norm = length(jnp.concatenate([scalar[..., None], vector], axis=-1))
     slope = jnp.polyval(jnp.asarray(_ARC_SLOPE[::-1], scalar.dtype), 2 * (scalar / norm) - 1)
-    # one division after the other: powers of the length overflow in single precision from 1e13 on
+    # separate divisions, because powers of lengths above 1e13 overflow in single precision
     along = _dot(vector / norm[..., None], vector_tangent)
     change = (2 * slope * along - scalar_tangent) / norm / norm
     return arc_ratio(scalar, vector), change
 
 
 _UNIT = 1e-3
-"""Tolerance on unit length and orthogonality, for numbers that were rounded for printing."""
+"""Tolerance of unit length and orthogonality, for numbers that were rounded for printing."""
 
 
-# Checks of what callers give, and the quaternions.
+# Checks of arguments, and the functions of quaternions.
 
 
 def as_quaternions(value: Any, name: str = "wxyz", *, unit: bool = False) -> Array:
-    """Quaternions (..., 4), none of them zero; ``unit``: of length one, where that is known."""
+    """Quaternions (..., 4); ValueError for concrete ones that are zero or, with ``unit``, not of
+    unit length."""
     wxyz = as_vectors(name, value, 4)
     if is_concrete(wxyz):
         _check_length(name, np.asarray(wxyz), unit, "(1, 0, 0, 0) is no rotation, scalar first")
@@ -219,7 +221,7 @@ def as_quaternions(value: Any, name: str = "wxyz", *, unit: bool = False) -> Arr
 
 
 def as_axes(name: str, value: Any) -> Array:
-    """Unit vectors (..., 3)."""
+    """Unit vectors (..., 3); ValueError for concrete ones that are not of unit length."""
     axes = as_vectors(name, value, 3)
     if is_concrete(axes):
         _check_length(name, np.asarray(axes), True, "divide the axis by its length")
@@ -230,10 +232,9 @@ def as_axes(name: str, value: Any) -> Array:
 def _check_length(name: str, values: np.ndarray, unit: bool, hint: str) -> None:
     if values.dtype.kind != "f":
         values = values.astype(np.float32)  # einsum does not support bfloat16
-    square = np.einsum(
-        "...i,...i->...", values, values
-    )  # ten times faster than the largest component
-    if np.any(square == 0):  # or so small that squares underflow
+    # ten times faster than the largest absolute component
+    square = np.einsum("...i,...i->...", values, values)
+    if np.any(square == 0):  # zero, or so small that squares underflow
         zero = np.all(values == 0, axis=-1)
         require(~zero, f"{name} must not be zero, got {describe(values)}: {hint}.")
     if not unit:
@@ -249,14 +250,17 @@ def _check_length(name: str, values: np.ndarray, unit: bool, hint: str) -> None:
 
 
 def as_matrices(value: Any) -> tuple[Array, Array]:
-    """Matrices (..., 3, 3), and which of them (...) are rotations: orthogonal, of determinant 1."""
+    """Matrices (..., 3, 3), and whether (...) they are rotations: orthogonal, with determinant 1.
+
+    ValueError for a concrete matrix that is not.
+    """
     matrix = value
     fits = isinstance(value, jax.Array) and value.shape[-2:] == (3, 3)
     if not fits or not jnp.issubdtype(value.dtype, jnp.floating):
         matrix = as_float_array("matrix", value, (3, 3), finite=False)
     if not is_concrete(matrix):
         return matrix, _rotation_error(jax.lax.stop_gradient(matrix))[0]
-    with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+    with jax.ensure_compile_time_eval():  # concrete numbers: evaluated now, even under jit
         good, size = _rotation_error(matrix)
         require(
             np.asarray(good) | np.isnan(size),
@@ -267,11 +271,11 @@ def as_matrices(value: Any) -> tuple[Array, Array]:
     return matrix, good
 
 
-@smooth  # a check of rounding errors: its comparisons are no kinks
+@smooth  # a check only: its comparisons do not affect results
 def _rotation_error(matrix: Array) -> tuple[Array, Array]:
-    """Which matrices are rotations, and the largest error of orthonormality."""
+    """Whether matrices are rotations, and their largest error of orthonormality."""
     a, b, c = (matrix[..., i, :] for i in range(3))
-    # of orthonormal, right-handed rows each is the vector product of the two others
+    # each of three orthonormal, right-handed rows is the cross product of the two others
     off = [jnp.cross(a, b) - c, jnp.cross(b, c) - a, jnp.cross(c, a) - b]
     size = jnp.max(jnp.abs(jnp.stack(off)), axis=(0, -1))
     return (size <= _UNIT) & (jnp.max(jnp.abs(matrix), axis=(-2, -1)) > 0.5), size
@@ -308,7 +312,7 @@ def wxyz_rate(
 
 
 def identity(shape: tuple[int, ...] = (), dtype: DTypeLike | None = None) -> Float[Array, "*b 4"]:
-    """Quaternions of no rotation, of leading shape ``shape``."""
+    """Identity quaternions (..., 4) with the leading axes ``shape``."""
     return jnp.zeros((*shape, 4), dtype or jnp.result_type(float)).at[..., 0].set(1)
 
 
@@ -329,7 +333,7 @@ def _as_pair(**arguments: tuple[Any, int]) -> tuple[Array, Array]:
     return first, second
 
 
-@jax.jit  # one program, not one for each operation; likewise below
+@jax.jit  # outside jit too, one program for all operations; likewise below
 def _product(left: Array, right: Array) -> Array:
     a, b, c, d = jnp.unstack(left, axis=-1)
     w, x, y, z = jnp.unstack(right, axis=-1)
@@ -353,9 +357,9 @@ def conjugate(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
 def rotate(
     wxyz: Float[ArrayLike, "*#b 4"], vector: Float[ArrayLike, "*#b 3"]
 ) -> Float[Array, "*b 3"]:
-    """Space components of a vector given by its body components, by a unit quaternion.
+    """Space components of a vector from its body components, by a unit quaternion.
 
-    Raises ValueError for a quaternion that is known not to be of unit length.
+    Raises ValueError for a concrete quaternion that is not of unit length.
     """
     as_quaternions(wxyz, unit=True)
     return _rotated(*_as_pair(wxyz=(wxyz, 4), vector=(vector, 3)))
@@ -369,13 +373,13 @@ def _rotated(wxyz: Array, vector: Array) -> Array:
 
 
 def normalise(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
-    """The unit quaternion of the same direction; the components must not all vanish.
+    """The unit quaternion with the same direction. A zero quaternion raises ValueError.
 
-    Scaled by the largest component first, so that neither tiny nor huge input is lost.
+    Tiny and huge input does not underflow or overflow: the largest component is scaled to 1 first.
     """
     wxyz = as_quaternions(wxyz)
     values = on_host(wxyz)
-    if isinstance(values, np.ndarray) and values.ndim == 1:  # without compiling a program
+    if isinstance(values, np.ndarray) and values.ndim == 1:  # by NumPy, without compilation
         values = values / np.max(np.abs(values))
         return as_float_array("wxyz", values / np.sqrt(np.sum(values**2)), finite=False)
     return _normalised(wxyz)
@@ -383,14 +387,14 @@ def normalise(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
 
 @smooth
 def _largest_of(*parts: Array) -> Array:
-    """Largest absolute value: a scale, which cancels."""
+    """Largest absolute value, used only as a scale that cancels."""
     return reduce(jnp.maximum, map(jnp.abs, parts))
 
 
 @jax.jit
 def _normalised(wxyz: Array) -> Array:
-    # Written out: XLA's sums over a short axis take twice as long as all else here. The result
-    # does not depend on the scale, so that its derivative may be left out.
+    # Sums are written out: an XLA sum over a short axis takes twice as long as the rest of this
+    # function. The scale cancels, so that its derivative may be omitted.
     parts = jnp.unstack(wxyz, axis=-1)
     scale = jax.lax.stop_gradient(_largest_of(*parts))
     size = jnp.sqrt(sum((x / scale) ** 2 for x in parts))
@@ -398,7 +402,7 @@ def _normalised(wxyz: Array) -> Array:
 
 
 def canonical(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
-    """The one of the two quaternions of a rotation whose scalar part is not negative."""
+    """Of the two quaternions of a rotation the one with a scalar part >= 0."""
     wxyz = as_vectors("wxyz", wxyz, 4)
     return jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
 
@@ -445,8 +449,8 @@ def xyzw_to_wxyz(xyzw: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
 def wxyz_to_scipy(wxyz: Float[ArrayLike, "*b 4"]) -> "Rotation":
     """SciPy's ``Rotation`` of quaternions, body -> space (its ``apply`` is our `rotate`).
 
-    Leading axes are flattened to the single one that every SciPy release knows; a lone quaternion
-    of shape (4,) gives a single rotation. Not for use under a JAX transformation.
+    Leading axes are flattened to a single one, the only form that all SciPy releases support; a
+    quaternion of shape (4,) gives a single rotation. Not for use under a JAX transformation.
     """
     if isinstance(wxyz, jax.core.Tracer):
         raise TypeError(

@@ -1,4 +1,5 @@
-// The page of polhode.plot.view: reads the motion beside it, draws it with three.js, follows the slider.
+// The page of polhode.plot.view: reads the motion from the page, draws it with three.js at the time
+// of the slider.
 (function () {
 "use strict";
 const motion = JSON.parse(document.getElementById("motion").textContent);
@@ -8,7 +9,7 @@ const COLORS = {
   rate: "#ff6b9d", path: "#58a9ff", ellipsoid: "#9db4d6", herpolhode: "#c9a4ff", plane: "#7f8ca3",
   solid: "#d9dde6",
 };
-const UP = new THREE.Vector3(0, 1, 0); // the way that three.js's cylinders, cones and grids point
+const UP = new THREE.Vector3(0, 1, 0); // direction of the cylinders, cones and grids of three.js
 
 // ---- numbers -------------------------------------------------------------------------------
 function decode(text, Kind) {
@@ -33,8 +34,8 @@ class Body {
       m[3] * omega.x + m[4] * omega.y + m[5] * omega.z,
       m[6] * omega.x + m[7] * omega.y + m[8] * omega.z);
   }
-  // Attitude, body rates and momentum at t: between samples along the shortest turn, unless the
-  // samples are too far apart to say what the body did between them.
+  // Attitude, body rates and momentum at t, interpolated along the shortest rotation between
+  // samples, or at the last sample if these are too far apart (`coarse`).
   at(t) {
     let low = 0, high = this.count - 1;
     while (high - low > 1) {
@@ -55,7 +56,7 @@ class Body {
 }
 
 // ---- pieces --------------------------------------------------------------------------------
-const shown = {}; // name of a key -> the objects that it shows and hides
+const shown = {}; // name of a check box -> the objects that it shows and hides
 function keyed(key, object) {
   (shown[key] ??= []).push(object);
   return object;
@@ -97,7 +98,7 @@ function label(text, color, size = 0.17) {
   return sprite;
 }
 
-// A curve: all of it faint, and what has passed bright.
+// A curve: all of it faint, and the part before the current time bright.
 function curve(points, color, width) {
   const group = new THREE.Group();
   const parts = [[0.28, 0.6 * width], [1, width]].map(([opacity, linewidth]) => {
@@ -151,7 +152,7 @@ function lit() {
   const sun = new THREE.DirectionalLight("#fff6e8", 2.4);
   const fill = new THREE.DirectionalLight("#9fc0ff", 0.7);
   scene.add(sun, fill);
-  scene.follow = (camera) => { // the light comes over the viewer's shoulder
+  scene.follow = (camera) => { // the lights move with the camera
     sun.position.set(-0.7, 1.1, 1.2).applyQuaternion(camera.quaternion);
     fill.position.set(1.2, -0.4, 0.5).applyQuaternion(camera.quaternion);
   };
@@ -309,7 +310,7 @@ function start() {
     const box = line.querySelector("input");
     box.checked = !motion.hidden.includes(name);
     const set = () => objects.forEach((one) => { one.visible = box.checked; });
-    box.addEventListener("change", () => { set(); ask(); });
+    box.addEventListener("change", () => { set(); requestDraw(); });
     byId("keys").append(line);
     set();
   }
@@ -321,7 +322,7 @@ function start() {
   slider.max = last;
   for (const factor of [0.1, 0.25, 0.5, 1, 2, 4, 10])
     speed.add(new Option(factor + " ×", factor, factor === 1, factor === 1));
-  let now = 0, playing = false, before = null, asked = false;
+  let now = 0, playing = false, before = null, isRequested = false;
   const ICONS = {
     true: '<svg width="14" height="14"><rect x="1" width="4" height="14"/><rect x="9" width="4" height="14"/></svg>',
     false: '<svg width="14" height="14"><path d="M3 0 L14 7 L3 14 Z"/></svg>',
@@ -331,7 +332,7 @@ function start() {
     before = null;
     play.innerHTML = ICONS[playing];
     play.title = playing ? "pause" : "play";
-    ask();
+    requestDraw();
   };
   play.addEventListener("click", () => {
     if (!playing && now >= last) now = 0;
@@ -341,8 +342,8 @@ function start() {
   window.addEventListener("keydown", (event) => {
     if (event.key === " " && event.target === document.body) play.click();
   });
-  controls.addEventListener("change", () => ask());
-  // page.html#t=12.5 shows the time 12.5, in the unit that the page shows
+  controls.addEventListener("change", () => requestDraw());
+  // page.html#t=12.5 opens at the time 12.5, in the time unit of the page
   const fromAddress = () => {
     const found = /[#&]t=([-+.\deE]+)/.exec(location.hash);
     if (!found) return false;
@@ -359,7 +360,7 @@ function start() {
       const rows = Math.ceil(count / columns), w = width / columns, h = height / rows;
       for (const tall of [false, true]) {
         const side = Math.min(tall ? w : w / 2, tall ? h / 2 : h);
-        // of layouts alike in size, that with bodies beside each other
+        // of layouts of similar size, prefer the one with more columns
         if (!best || side > 0.93 * best.side) best = { side: Math.max(side, best?.side ?? 0), columns, tall };
       }
     }
@@ -367,7 +368,7 @@ function start() {
     cells.style.gridAutoRows = "minmax(0, 1fr)";
     for (const cell of cells.children) cell.classList.toggle("tall", best.tall);
     renderer.setSize(width, height);
-    ask();
+    requestDraw();
   }
 
   function draw() {
@@ -383,7 +384,7 @@ function start() {
       const box = pane.element.getBoundingClientRect();
       const aspect = box.width / box.height;
       camera.aspect = aspect;
-      const half = Math.tan(Math.PI / 12); // the unit ball fits into the narrower side
+      const half = Math.tan(Math.PI / 12); // so that the unit ball fits into the narrower side
       camera.fov = 2 * Math.atan(aspect >= 1 ? half : half / aspect) * 180 / Math.PI;
       camera.updateProjectionMatrix();
       pane.scene.follow(camera);
@@ -394,21 +395,21 @@ function start() {
     }
   }
 
-  function ask() {
-    if (!asked) {
-      asked = true;
+  function requestDraw() {
+    if (!isRequested) {
+      isRequested = true;
       requestAnimationFrame(step);
     }
   }
   function step(clock) {
-    asked = false;
+    isRequested = false;
     if (playing) {
       if (before !== null) now += (clock - before) / 1000 * motion.pace * Number(speed.value);
       before = clock;
       if (now > last) now %= last;
     }
     draw();
-    if (playing) ask();
+    if (playing) requestDraw();
   }
 
   new ResizeObserver(layout).observe(stage);
