@@ -41,8 +41,8 @@ from polhode._kernels import (
 class Costate(Protocol):
     """Adjoint equations for states of a special form, such as momentum and quaternion.
 
-    - ``begin(y, costate)``: the variables z, integrated backwards from the state ``y`` at the end,
-      where the costate is ``costate``;
+    - ``begin(y, costate)``: the variables z, integrated backwards from the state ``y`` and the
+      ``costate`` at the end;
     - ``rates(t, z, args)``: dz/dt, and K (n,), whose derivative by any of ``args`` is the
       contribution of that argument per unit time;
     - ``finish(z, start, end, costate)``: the costate at the start, for ``costate`` at the end;
