@@ -44,7 +44,7 @@ TANGENT = "_closed_forms/_free_tangent.py"
 ORBIT, WHEELS, FRAME = "_scene/_orbits.py", "_scene/_wheels.py", "frames/_frame.py"
 LAWS, LVLH = "_scene/_control.py", "_scene/_orbits.py"
 STEPS, LOOP = "_integrate/_step_derivative.py", "_integrate/_loop.py"
-TURN = "_integrate/_turn.py"
+ITERATION = "_integrate/_iteration.py"
 FLOW, FOUND = "_integrate/_flow_derivative.py", "_integrate/_switch_location.py"
 SEARCH, RESIDUALS = "_events/_search.py", "fit/_residuals.py"
 LIGHT, PROPAGATE = "lightcurve/_brightness.py", "_propagate.py"
@@ -315,14 +315,14 @@ MUTANTS = (
     ),
     # integration: error control, switches, events and derivatives
     Mutant(
-        TURN,
+        ITERATION,
         "* options.rtol.astype(error.dtype) * angle / (total_angle * drift)",
         "* options.rtol.astype(error.dtype)",
         "each step may have the error of the whole motion",
         ("solvers/test_switches.py::test_states_through_switches",),
     ),
     Mutant(
-        TURN,
+        ITERATION,
         "error = error + control.SIXTH_DIFFERENCE * length_of",
         "error = error + 0 * length_of",
         "a step that passes something narrow measures its error by chance",
@@ -332,9 +332,9 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        TURN,
-        "rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign",
-        "rises = jnp.where(turn.levels[row] > 0, -1, 1) * sign",
+        ITERATION,
+        "rises = jnp.where(switch.levels[row] > 0, 1, -1) * sign",
+        "rises = jnp.where(switch.levels[row] > 0, -1, 1) * sign",
         "the direction of an event is the opposite",
         ("test_events.py::test_events_of_a_simulation_in_order_of_time",),
     ),
@@ -368,21 +368,21 @@ MUTANTS = (
     ),
     Mutant(
         FLOW,
-        "jnp.where(is_known, x, r) for x, r in zip(end, rest)",
+        "jnp.where(is_finite, x, r) for x, r in zip(end, state_at_rest)",
         "x for x in end",
         "a failed body makes gradients through a matrix NaN",
         (OTHERS + "steps too short, a matrix]",),
     ),
     Mutant(
         FLOW,
-        "(jnp.where(is_known, x, 0) + nothing for x in start_slopes)",
-        "(x + nothing for x in start_slopes)",
+        "(jnp.where(is_finite, x, 0) + zero_or_nan for x in start_costate)",
+        "(x + zero_or_nan for x in start_costate)",
         "a failed body makes gradients of a batch NaN",
         (OTHERS + "weight, overflow]",),
     ),
     Mutant(
         STEPS,
-        "jnp.where(any_finished, x, jnp.sum(nothing).astype(x.dtype))",
+        "jnp.where(any_finished, x, jnp.sum(zero_or_nan).astype(x.dtype))",
         "jnp.where(any_finished, x, 0.0)",
         "a gradient of zero where all bodies failed",
         (OTHERS + "kinks, overflow]",),
@@ -395,15 +395,15 @@ MUTANTS = (
         (OTHERS + "undefined at a command]",),
     ),
     Mutant(
-        TURN,
-        "reach = jnp.where(moves, reach, 0)",
-        "reach = jnp.where(moves, 0.0, 0)",
+        ITERATION,
+        "snap_time = jnp.where(is_moved, snap_time, 0)",
+        "snap_time = jnp.where(is_moved, 0.0, 0)",
         "a switch turns where the field of its other side is undefined",
         ("solvers/test_switches.py::test_roots_of_a_size_that_passes_zero",),
     ),
     Mutant(
-        TURN,
-        "proposed = jnp.where(snaps, reach, proposed)",
+        ITERATION,
+        "proposed = jnp.where(snaps, snap_time, proposed)",
         "proposed = jnp.where(snaps, guess, proposed)",
         "the first step from a point of infinite slope is long, and derivatives are wrong",
         ("solvers/test_switches.py::test_roots_of_a_size_that_passes_zero",),
@@ -417,8 +417,8 @@ MUTANTS = (
     ),
     Mutant(
         LOOP,
-        "record = count + 1, put_in(notes, count, noted(motion, progress))",
-        "record = count + 1, put_in(notes, count + 1, noted(motion, progress))",
+        "record = count + 1, with_row(notes, count, note_of(motion, progress))",
+        "record = count + 1, with_row(notes, count + 1, note_of(motion, progress))",
         "steps are recorded one place too late",
         ("solvers/test_switches.py::test_a_gradient_through_a_jump",),
     ),
@@ -431,7 +431,7 @@ MUTANTS = (
     ),
     Mutant(
         "_integrate/_explicit_step.py",
-        "([rounded, rest] if rest.any() else [rounded])",
+        "([rounded, remainder] if remainder.any() else [rounded])",
         "[rounded]",
         "the weights of a Runge-Kutta step are rounded in single precision",
         (
@@ -440,8 +440,8 @@ MUTANTS = (
     ),
     Mutant(
         FOUND,
-        "tolerance = 4 * eps * jnp.maximum(1, grain / 16)",
-        "tolerance = 4 * eps * jnp.maximum(1, grain)",
+        "tolerance = 4 * eps * jnp.maximum(1, time_spacing / 16)",
+        "tolerance = 4 * eps * jnp.maximum(1, time_spacing)",
         "switches turn late, by a few units of rounding of the time",
         (
             "solvers/test_switches.py::test_single_precision_turns_no_switch_late_and_rounds_no_weight",
@@ -463,22 +463,22 @@ MUTANTS = (
     ),
     Mutant(
         FOUND,
-        "change = jnp.where(hit, -value(part) / slope, 0)",
-        "change = jnp.where(hit, value(part) / slope, 0)",
+        "change = jnp.where(hit, -value(fraction) / margin_rate, 0)",
+        "change = jnp.where(hit, value(fraction) / margin_rate, 0)",
         "derivatives by the place of a switch have the wrong sign",
         ("solvers/test_switches.py::test_derivatives_through_a_table[argmax-forward]",),
     ),
     Mutant(
         SEARCH,
-        "use, beside = jax.tree.map(lambda x: x[-2], of_passes)",
-        "use, beside = jax.tree.map(lambda x: x[-1], of_passes)",
+        "use, auxiliary = jax.tree.map(lambda x: x[-2], of_passes)",
+        "use, auxiliary = jax.tree.map(lambda x: x[-1], of_passes)",
         "events between two samples are those of a pass that did not know their turning points",
         ("test_events.py::test_pairs_of_events_that_no_sample_shows_have_their_states",),
     ),
     Mutant(
         SEARCH,
-        "walk = kernel(_next)(walk, jnp.where(is_turning, slopes, values), values)",
-        "walk = kernel(_next)(walk, values, values)",
+        "bracket = kernel(_update)(bracket, jnp.where(is_turning, derivatives, values), values)",
+        "bracket = kernel(_update)(bracket, values, values)",
         "turning points between two samples are not found",
         ("test_events.py::test_a_motion_in_closed_form_stops_at_its_first_event",),
     ),

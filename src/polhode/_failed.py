@@ -12,7 +12,7 @@ NaN by numbers, and write NaN to their results at the end.
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._kernels import any_of, attached, linear
+from polhode._kernels import any_of, linear, with_derivative_rule
 from polhode._scene import State
 
 
@@ -49,7 +49,7 @@ def where_lost(x: Array, is_known: Array, value: float = jnp.nan) -> Array:
 
         return linear(tangent, cotangent, [operands[1]], [tangents[0]], [operands[0]])
 
-    return attached(rule, [x, is_known], [jnp.where(is_known, x, value)])[0]
+    return with_derivative_rule(rule, [x, is_known], [jnp.where(is_known, x, value)])[0]
 
 
 def numbers(x: Array, value: float) -> Array:
@@ -69,7 +69,7 @@ def numbers(x: Array, value: float) -> Array:
 
         return linear(tangent, cotangent, [is_known], [tangents[0]], values)
 
-    return attached(rule, [x], [x], again)[0]
+    return with_derivative_rule(rule, [x], [x], again)[0]
 
 
 def with_gradients(x: Array, is_sound: Array, any_finished: Array) -> Array:
@@ -94,4 +94,6 @@ def with_gradients(x: Array, is_sound: Array, any_finished: Array) -> Array:
         nothing = jnp.where(any_finished, 0, jnp.nan).astype(values[0].dtype)
         return linear(tangent, cotangent, [mask, is_known, nothing], [tangents[0]], values)
 
-    return attached(rule, [x, mask, any_of(any_finished)], [jnp.where(mask, x, jnp.nan)])[0]
+    return with_derivative_rule(
+        rule, [x, mask, any_of(any_finished)], [jnp.where(mask, x, jnp.nan)]
+    )[0]

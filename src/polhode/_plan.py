@@ -294,8 +294,8 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
         if isinstance(jacobian, Tracer):  # a function in the scene closes over a traced value
             return np.zeros(jacobian.shape[:-2])
         jacobian = np.asarray(jacobian, float)
-        sound = np.where(np.isfinite(jacobian), jacobian, 0)
-        rates.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
+        finite_jacobian = np.where(np.isfinite(jacobian), jacobian, 0)
+        rates.append(np.max(-np.linalg.eigvals(finite_jacobian).real, axis=-1))
     return np.max(np.stack(rates), axis=0)
 
 

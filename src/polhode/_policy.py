@@ -127,19 +127,19 @@ RECORD_SEGMENTS = 256
 """[segments] Of the recorded steps (checkpointing): reverse mode replays one segment at a time, and
 stores one state for each segment and one for each step of the current segment."""
 
-RECORDED_TURNS = 512
-"""[turns] Iterations of the loop of explicit steps that are recorded, at most, while values for a
+RECORDED_ITERATIONS = 512
+"""[iterations] Of the loop of explicit steps: maximum number that is recorded while values for a
 derivative are computed. A motion with more of them is integrated again for reverse mode."""
 
-RECORDED_TURNS_OF_FEW = 128
-"""[turns] The same for a few bodies, since ``jax.vmap`` may multiply their number later: the
+RECORDED_ITERATIONS_OF_FEW = 128
+"""[iterations] The same for a few bodies, since ``jax.vmap`` may multiply their number later: the
 records of 100,000 take 2 GB."""
 
 RECORDED_MEMORY = 2**26
 """[bytes] Limit on these records, for all bodies together."""
 
-FEWEST_RECORDED_TURNS = 64
-"""[turns] If RECORDED_MEMORY allows fewer, none are recorded: most motions take more."""
+MIN_RECORDED_ITERATIONS = 64
+"""[iterations] If RECORDED_MEMORY allows fewer, none are recorded: most motions take more."""
 
 COMPENSATED_STEPS = 20_000
 """[eps] Tolerance below which steps use compensated summation. Without it rounding errors grow to
@@ -172,7 +172,7 @@ ACCELERATOR_SAMPLES = 2**18
 the chunk sizes of a CPU a million free bodies take 4 times as long on an H200, and a million of
 Lagrange's tops 300 times as long; in a single chunk, tops take twice as long in float64."""
 
-EVENT_LOOK = 128
+EVENT_SAMPLES = 128
 """[bodies times samples] Evaluated together in the search for the first event of a closed form, two
 samples of each body at least. With two samples at a time a single body takes three to six times as
 long, because each evaluation computes the constants of the motion. With a whole window at a time
@@ -275,11 +275,11 @@ def bodies_to_save(samples: int) -> int:
     return max(LANES, sample_limit // samples)
 
 
-def recorded_turns(bodies: int, memory: int) -> int:
+def recorded_iterations(bodies: int, memory: int) -> int:
     """Iterations of the loop that are recorded; each takes ``memory`` bytes for each body."""
-    limit = RECORDED_TURNS if bodies > KERNEL_BODIES else RECORDED_TURNS_OF_FEW
-    turns = min(limit, RECORDED_MEMORY // (bodies * memory))
-    return turns if turns >= FEWEST_RECORDED_TURNS else 0
+    limit = RECORDED_ITERATIONS if bodies > KERNEL_BODIES else RECORDED_ITERATIONS_OF_FEW
+    iterations = min(limit, RECORDED_MEMORY // (bodies * memory))
+    return iterations if iterations >= MIN_RECORDED_ITERATIONS else 0
 
 
 def samples_at_once(chunk: int) -> int:

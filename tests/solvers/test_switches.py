@@ -16,7 +16,7 @@ import polhode as ph
 from polhode import rotation
 from polhode._integrate import Automatic
 from polhode._integrate._explicit_step import dense_of, dense_state
-from polhode._integrate._switches import switched
+from polhode._integrate._switches import switches_of
 from polhode._integrate._tableau import TSIT5
 from polhode._kernels import smooth
 
@@ -29,7 +29,7 @@ TABLE = jnp.array([-0.9, -0.1, 0.3, 0.8])
 
 def program(fn, *examples):
     """``fn`` of one moving vector, with its switches apart."""
-    return switched(jax.make_jaxpr(fn)(*examples), [True] * len(examples), jnp.float64)
+    return switches_of(jax.make_jaxpr(fn)(*examples), [True] * len(examples), jnp.float64)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from xla.operations import operations
 import polhode as ph
 from polhode._checks import as_float_array
 from polhode._integrate import _field, _flow_derivative, _problem
-from polhode._kernels import is_holdable
+from polhode._kernels import is_fusible
 
 
 @pytest.mark.parametrize(
@@ -101,11 +101,11 @@ def test_a_table_fits_into_a_fused_kernel():
     for order in (1, 3):
         table = ph.Table(times, np.sin(np.outer(times, [1e-3, 2e-3, 3e-3])), order=order)
         for t in (0.0, jnp.array([-5.0, 30.0, 7200.0])):
-            assert is_holdable(jax.make_jaxpr(table)(t).jaxpr)
+            assert is_fusible(jax.make_jaxpr(table)(t).jaxpr)
 
 
 @pytest.mark.parametrize("number", [3.0, 3, np.float64(3.0), [3.0], np.array([3.0])])
 def test_a_number_in_a_traced_function_fits_into_a_fused_kernel(number):
     """``jax.device_put`` of a Python number would be a separate operation."""
     program = jax.make_jaxpr(lambda x: x * as_float_array("number", number))(1.0)
-    assert is_holdable(program.jaxpr)
+    assert is_fusible(program.jaxpr)

@@ -4,14 +4,14 @@ import jax
 import jax.numpy as jnp
 
 from polhode._closed_forms._free_constants import _rounded_constants
-from polhode._integrate._switches import _subjaxprs
+from polhode._kernels import subjaxprs
 
 
 def _conversions(jaxpr):
     """First and last dtype of every value that is converted twice in succession."""
     found, again = {}, []
     for equation in jaxpr.eqns:
-        for inner in _subjaxprs(equation):
+        for inner in subjaxprs(equation):
             again += _conversions(inner)
         if equation.primitive.name == "convert_element_type":
             (given,), (made,) = equation.invars, equation.outvars

@@ -107,7 +107,7 @@ def test_a_linear_map_is_compiled_as_asked_and_differentiated_as_written():
 def test_what_bodies_share_stays_shared_in_a_batch_of_units():
     """With unshared times each body would take its own backward steps: 1.7 times as long."""
     batched = jnp.ones((4, 3)), jnp.ones(3)
-    depends = _fused._depend_on(
+    depends = _fused._batched_results(
         lambda x, t: [x * t, jnp.sin(t), jax.lax.cond(t[0] > 0, lambda: x, lambda: 2 * x), t],
         batched,
         (0, None),
@@ -286,7 +286,7 @@ def test_tops_at_rest_or_without_weight_are_corrected_body_by_body():
     scene = ph.Scene(SYMMETRIC, ph.UniformGravity.axial(1.0, 0.5))
     state = ph.State(jnp.ones((5, 4)), jnp.ones((5, 3)))
     program = jax.make_jaxpr(lambda s: ph.simulate(scene, s, jnp.array([0.0, 1.0])).wxyz)(state)
-    programs = list(_fused._programs(program.jaxpr))
+    programs = list(_fused.nested_jaxprs(program.jaxpr))
     (cond,) = (e for p in programs for e in p.eqns if e.primitive.name == "cond")
     corrected = [e for b in cond.params["branches"] for e in b.jaxpr.eqns]
     assert [e.params["length"] for e in corrected if e.primitive.name == "scan"] == [5]

@@ -72,10 +72,10 @@ class AbstractChunkedForm(AbstractClosedForm):
             elapsed = sample_times - times[..., :1]
             n = state.wxyz.shape[0]
             elapsed = jnp.broadcast_to(elapsed if elapsed.ndim == 2 else elapsed[None], (n, count))
-            wxyz, omega, holds = self._motion(scene, state, elapsed)
+            wxyz, omega, is_valid = self._motion(scene, state, elapsed)
             if not record.final_only:
                 wxyz, omega = with_first(state, wxyz, omega)
-            return _samples(wxyz, omega, holds, record)
+            return _samples(wxyz, omega, is_valid, record)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         return map_chunks(of_chunk, (lanes, times), n, self._chunk_size(n, count))
@@ -98,12 +98,12 @@ def with_first(
     return wxyz, omega
 
 
-def _samples(wxyz, omega, holds, record: Record) -> Samples:
+def _samples(wxyz, omega, is_valid, record: Record) -> Samples:
     finite = jnp.all(jnp.isfinite(omega), axis=(-1, -2))
     if record.attitude:
         finite = finite & jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
-    status = jnp.where(finite & holds, Status.SUCCESSFUL, Status.NOT_FINITE)
-    wxyz, omega = (jnp.where(holds[:, None, None], x, jnp.nan) for x in (wxyz, omega))
+    status = jnp.where(finite & is_valid, Status.SUCCESSFUL, Status.NOT_FINITE)
+    wxyz, omega = (jnp.where(is_valid[:, None, None], x, jnp.nan) for x in (wxyz, omega))
     return Samples(
         wxyz if record.attitude else None,
         omega if record.rates else None,

@@ -86,8 +86,10 @@ class SymmetricTop(AbstractChunkedForm):
             state.omega_body[:, 2] - axial / transverse,
             decay(transverse_decay[:, None], elapsed),
         )
-        holds = (moments[:, 0] == moments[:, 1]) & jnp.all(torque[:, :2] == 0, axis=-1)
-        holds = holds & (damping[:, 0] == damping[:, 1]) & wheels_have_constant_momentum(scene, n)
+        is_valid = (moments[:, 0] == moments[:, 1]) & jnp.all(torque[:, :2] == 0, axis=-1)
+        is_valid = (
+            is_valid & (damping[:, 0] == damping[:, 1]) & wheels_have_constant_momentum(scene, n)
+        )
         direction_is_constant = (
             (torque[:, 2] == 0)
             & _equal(transverse_decay, axial_decay)
@@ -97,7 +99,7 @@ class SymmetricTop(AbstractChunkedForm):
             zero = _zero_of_fixed_direction(torque[:, 2], damping[:, 0], wheel_momentum)
             wxyz = wxyz + zero[:, None, None]
         wxyz = jnp.where(direction_is_constant[:, None, None], wxyz, jnp.nan)
-        return wxyz, omega, holds
+        return wxyz, omega, is_valid
 
 
 def _zero_of_fixed_direction(torque: Array, damping: Array, wheel_momentum: Array) -> Array:

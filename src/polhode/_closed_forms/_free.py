@@ -337,7 +337,7 @@ def _evaluate_rule(requested, primals, tangents):
     (polhode, precession), arguments = primals
     t = jax.lax.stop_gradient(arguments[-1])
     # In finer stages: the tangent consists of many loops, and XLA would repeat the motion in each.
-    at = advance(polhode, precession, t, fine=True)
+    at = advance(polhode, precession, t, more_stages=True)
     motion = EvaluatedMotion(polhode, precession, at, _results(requested, polhode, precession, at))
     return results_rule(requested, (motion, arguments), (None, tangents[1]))
 
@@ -369,13 +369,13 @@ def symmetric_motion(
     """
     transverse, axial = moments[..., 0], moments[..., 2]
     slip = (transverse - axial) / transverse * omega_body[..., 2]
-    later = later_rates = None
+    wxyz_at_t = omega_at_t = None
     if rates:
         # here and below: computed once, not again for each component of the result
         cos, sin = computed_once((jnp.cos(slip * t), jnp.sin(slip * t)))
         x, y = omega_body[..., 0], omega_body[..., 1]
         spin = jnp.broadcast_to(omega_body[..., 2], cos.shape)
-        later_rates = jnp.stack([x * cos + y * sin, y * cos - x * sin, spin], axis=-1)
+        omega_at_t = jnp.stack([x * cos + y * sin, y * cos - x * sin, spin], axis=-1)
     if attitude:
         own_momentum = computed_once(omega_body * moments)
         momentum = rotation.rotate(wxyz, own_momentum) / transverse[..., None]
@@ -383,11 +383,11 @@ def symmetric_motion(
         precession = rotation.rotation_vector_to_wxyz(angle)
         half = slip * t / 2
         zero = jnp.zeros_like(half)
-        axial_turn = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
-        precession, axial_turn = computed_once((precession, axial_turn))
+        axial_rotation = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
+        precession, axial_rotation = computed_once((precession, axial_rotation))
         after_precession = computed_once(rotation.multiply(precession, wxyz))
-        later = rotation.multiply(after_precession, axial_turn)
-    return SymmetricMotion(later, later_rates)
+        wxyz_at_t = rotation.multiply(after_precession, axial_rotation)
+    return SymmetricMotion(wxyz_at_t, omega_at_t)
 
 
 def spherical_motion(
@@ -400,9 +400,9 @@ def spherical_motion(
 ) -> SymmetricMotion:
     """Constant rates of a body with three equal moments: rotation about a fixed axis."""
     shape = jnp.broadcast_shapes(omega_body.shape[:-1], t.shape)
-    later = None
+    wxyz_at_t = None
     if attitude:
-        turn = rotation.rotation_vector_to_wxyz(omega_body * t[..., None])
-        turn = computed_once(turn)
-        later = rotation.multiply(wxyz, turn)
-    return SymmetricMotion(later, jnp.broadcast_to(omega_body, (*shape, 3)) if rates else None)
+        rotation_quaternion = rotation.rotation_vector_to_wxyz(omega_body * t[..., None])
+        rotation_quaternion = computed_once(rotation_quaternion)
+        wxyz_at_t = rotation.multiply(wxyz, rotation_quaternion)
+    return SymmetricMotion(wxyz_at_t, jnp.broadcast_to(omega_body, (*shape, 3)) if rates else None)

@@ -146,25 +146,25 @@ def _functions_rule(has_time_axis, primals, tangents):
     # With each half turn the integrals grow by twice those over a quarter period. The incomplete
     # and the complete parts are differentiated separately; their sum is smooth where the number of
     # half turns changes.
-    _, turn = jax.jvp(
+    _, quarter_variation = jax.jvp(
         functools.partial(_quarter_formula, polhode.circular, polhode.on_separatrix),
         (x, z),
         (dx, dz),
     )
     parts = tuple(
         a + jnp.where(half_turns == 0, 0, 2 * half_turns * b)
-        for a, b in zip(variation, turn, strict=True)
+        for a, b in zip(variation, quarter_variation, strict=True)
     )
     return value, (dS, dC, dN, *parts)
 
 
-def _axes_turn(_, arguments) -> Triple:
+def _axes_rotation(_, arguments) -> Triple:
     """Rotation of the principal axes by small entries xy, xz, yz of the tensor."""
     (a, b, c), (xy, xz, yz) = arguments
     return over_gap(yz, b, c), over_gap(xz, c, a), over_gap(xy, a, b)
 
 
-def along_turning_axes(arguments, dm, dp, dw):
+def along_rotating_axes(arguments, dm, dp, dw):
     """Arguments and tangents along principal axes that rotate with the tensor, and the function
     that transforms a vector back to the body axes.
 
@@ -173,21 +173,25 @@ def along_turning_axes(arguments, dm, dp, dw):
     second derivatives by the product between them are NaN.
     """
     moments, products, omega, wxyz, t = arguments
-    none = tuple(jnp.zeros_like(x) for x in products)
-    turn = with_formula_derivative(_axes_turn, none, (), (moments, products))
+    zeros = tuple(jnp.zeros_like(x) for x in products)
+    axes_rotation = with_formula_derivative(_axes_rotation, zeros, (), (moments, products))
 
     # In axes that rotate with the tensor, its products remain zero. The differentiated functions
     # then depend on moments only, as the closed form does, and vectors are transformed back.
-    def along(v):
-        return None if v is None else tuple(a - b for a, b in zip(v, cross(turn, v), strict=True))
+    def in_rotating_axes(v):
+        return (
+            None
+            if v is None
+            else tuple(a - b for a, b in zip(v, cross(axes_rotation, v), strict=True))
+        )
 
     def to_body(v):
-        return tuple(a + b for a, b in zip(v, cross(turn, v), strict=True))
+        return tuple(a + b for a, b in zip(v, cross(axes_rotation, v), strict=True))
 
     if dm is not None or dp is not None:
-        a, b, c = none if dm is None else dm
-        xy, xz, yz = none if dp is None else dp
-        x, y, z = turn
+        a, b, c = zeros if dm is None else dm
+        xy, xz, yz = zeros if dp is None else dp
+        x, y, z = axes_rotation
         # M K - K M, where K is the cross-product matrix of the rotation
         dm = (a + 2 * (xy * z - xz * y), b + 2 * (yz * x - xy * z), c + 2 * (xz * y - yz * x))
         dp = (
@@ -195,8 +199,8 @@ def along_turning_axes(arguments, dm, dp, dw):
             xz + (a - c) * y - xy * x + yz * z,
             yz + (c - b) * x + xy * y - xz * z,
         )
-    arguments = moments, jax.lax.stop_gradient(products), along(omega), wxyz, t
-    return arguments, dm, dp, along(dw), to_body
+    arguments = moments, jax.lax.stop_gradient(products), in_rotating_axes(omega), wxyz, t
+    return arguments, dm, dp, in_rotating_axes(dw), to_body
 
 
 def variation_at_rest(at_rest, arguments, dw, dt) -> tuple[Triple, Triple]:
@@ -267,7 +271,7 @@ def start_variation(polhode: Polhode, frame: Frame, dm, dp, dw) -> Variation:
     )
 
 
-def _relative_turn(
+def _relative_rotation(
     polhode: Polhode, precession: Precession, frame: Frame, at: Instant, momentum_step: Triple
 ):
     """Quaternion from the attitude at t to that at the start, whose vector part is accurate if it
@@ -291,7 +295,7 @@ def _relative_turn(
     return scalar, vector
 
 
-def _turn_tangent(
+def _rotation_tangent(
     polhode,
     frame: Frame,
     functions,
@@ -329,11 +333,11 @@ def _turn_tangent(
         )
     L_now = frame.reflected(momentum_at_t)
     inverse_square = 1 / dot(start, start)
-    turn = tuple(
+    rotation = tuple(
         (a + about_L * b) * inverse_square
         for a, b in zip(cross(L_now, momentum_lag), L_now, strict=True)
     )
-    return frame.reflected(turn)
+    return frame.reflected(rotation)
 
 
 def _regularised(polhode: Polhode, at: Instant, t: Scalars) -> Instant:
@@ -369,7 +373,7 @@ class _Tangent(NamedTuple):
     momentum_at_t: Triple
     variation: Variation
     momentum: Triple
-    turn: Triple | None
+    rotation: Triple | None
 
 
 def _tangent(
@@ -402,10 +406,10 @@ def _tangent(
         momentum_tangent(polhode, functions, momentum_at_t, by, variation, stage)
     )
     total = tuple(g + m for g, m in zip(variation.momentum, variation_since_start, strict=True))
-    turn = None
+    rotation = None
     if attitude:
         relative = _relative(has_time_axis, motion._replace(results=None), arguments)
-        turn = _turn_tangent(
+        rotation = _rotation_tangent(
             polhode,
             frame,
             functions,
@@ -416,7 +420,7 @@ def _tangent(
             first,
             scaled_time,
         )
-    return _Tangent(polhode, frame, momentum_at_t, variation, total, turn)
+    return _Tangent(polhode, frame, momentum_at_t, variation, total, rotation)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -434,7 +438,7 @@ def _relative(has_time_axis: bool, motion: EvaluatedMotion, arguments):
         sigma_pi * polhode.s * j13,
         -sigma_pi * polhode.p * j12,
     )
-    return _relative_turn(polhode, motion.precession, Frame(polhode), at, momentum_step)
+    return _relative_rotation(polhode, motion.precession, Frame(polhode), at, momentum_step)
 
 
 def _relative_rule(has_time_axis, primals, tangents):
@@ -442,8 +446,8 @@ def _relative_rule(has_time_axis, primals, tangents):
     dm, dp, dw, _, dt = (dense_or_none(d, x) for d, x in zip(tangents[1], arguments, strict=True))
     scalar, vector = value = _relative(has_time_axis, motion, arguments)
     tangent = _tangent(has_time_axis, True, motion, arguments, dm, dp, dw)
-    turn = _turn_in_time(tangent, dt)
-    half = tuple(x / 2 for x in tangent.frame.reflected(turn))
+    rotation = _rotation_in_time(tangent, dt)
+    half = tuple(x / 2 for x in tangent.frame.reflected(rotation))
     vector_variation = tuple(scalar * a + b for a, b in zip(half, cross(vector, half), strict=True))
     return value, (-dot(vector, half), vector_variation)
 
@@ -451,15 +455,15 @@ def _relative_rule(has_time_axis, primals, tangents):
 _relative.defjvp(_relative_rule, symbolic_zeros=True)
 
 
-def _turn_in_time(tangent: _Tangent, dt) -> Triple:
-    turn, polhode = tangent.turn, tangent.polhode
-    if turn is None:
+def _rotation_in_time(tangent: _Tangent, dt) -> Triple:
+    rotation, polhode = tangent.rotation, tangent.polhode
+    if rotation is None:
         raise ValueError("the tangent was computed for the rates alone: request the attitude.")
     if dt is None:
-        return turn
+        return rotation
     return triple(
         e + n * d * (polhode.rate_unit * dt)
-        for e, n, d in zip(turn, tangent.momentum_at_t, polhode.inverse_moments, strict=True)
+        for e, n, d in zip(rotation, tangent.momentum_at_t, polhode.inverse_moments, strict=True)
     )
 
 
@@ -483,7 +487,7 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
     dm, dp, dw, dq, dt = (dense_or_none(d, x) for d, x in zip(tangents, arguments, strict=True))
     start, to_body = arguments[3], tuple
     if arguments[1] is not None:
-        arguments, dm, dp, dw, to_body = along_turning_axes(arguments, dm, dp, dw)
+        arguments, dm, dp, dw, to_body = along_rotating_axes(arguments, dm, dp, dw)
     tangent = _tangent(requested[2], requested[0], motion, arguments, dm, dp, dw)
     polhode, frame, (n1, n2, n3) = tangent.polhode, tangent.frame, tangent.momentum_at_t
     at_rest = polhode.rate_unit == 0
@@ -514,14 +518,14 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
             )
         )
     if requested[0]:
-        turn = _turn_in_time(tangent, dt)
-        turn = to_body(
+        rotation = _rotation_in_time(tangent, dt)
+        rotation = to_body(
             tuple(
                 jnp.where(at_rest, h, e)
-                for h, e in zip(d_attitude_at_rest, frame.to_body(turn), strict=True)
+                for h, e in zip(d_attitude_at_rest, frame.to_body(rotation), strict=True)
             )
         )
-        d_wxyz = quaternion_product(results[1], (jnp.zeros_like(n1), *(x / 2 for x in turn)))
+        d_wxyz = quaternion_product(results[1], (jnp.zeros_like(n1), *(x / 2 for x in rotation)))
         if dq is not None:
             d_wxyz = _start_tangent(start, dq, results[1], d_wxyz)
     # staged: otherwise XLA computes all components again for each entry of the stacked result

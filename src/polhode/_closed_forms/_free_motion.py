@@ -148,18 +148,19 @@ def half_angle(
     return cosine * f - sine * g, cosine * g + sine * f
 
 
-def advance(polhode: Polhode, precession: Precession | None, t: Scalars, fine: bool = False):
+def advance(polhode: Polhode, precession: Precession | None, t: Scalars, more_stages: bool = False):
     """The ``Instant`` of time t.
 
     It is computed in stages (see ``staged``): without them XLA repeats all arithmetic in the loop
-    over each component of the result. ``fine``: more stages, for results that many loops use.
+    over each component of the result. ``more_stages``: more stages, for results that many loops
+    use.
     """
     one = opaque_ones(t * polhode.one)
 
     def stage(values):
         return staged(values, one)
 
-    extra_stage = stage if fine else (lambda x: x)
+    extra_stage = stage if more_stages else (lambda x: x)
     half_turns, fraction = extra_stage(half_turns_at(polhode, t))
     half, reduced = jacobi(polhode, fraction, stage)
     reduced = extra_stage(reduced)

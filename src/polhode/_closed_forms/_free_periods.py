@@ -25,7 +25,7 @@ from polhode._closed_forms._free_constants import (
     precession_constants,
 )
 from polhode._closed_forms._free_derivatives import (
-    along_turning_axes,
+    along_rotating_axes,
     dense_or_none,
     start_variation,
 )
@@ -160,8 +160,10 @@ def _values_and_constants(arguments):
         jnp.where(permanent, level, _mean_precession(polhode, precession, rate_unit))
         * polhode.rate_unit
     )
-    turns = jnp.where(on_separatrix, 0, polhode.half_turn_rate)
-    P_psi = jnp.where(turns > 0, 2 / jnp.where(turns > 0, turns, 1), jnp.inf)
+    half_turn_rate = jnp.where(on_separatrix, 0, polhode.half_turn_rate)
+    P_psi = jnp.where(
+        half_turn_rate > 0, 2 / jnp.where(half_turn_rate > 0, half_turn_rate, 1), jnp.inf
+    )
     P_phi = jnp.where(about > 0, 2 * math.pi / jnp.where(about > 0, about, 1), jnp.inf)
     low, high = _angles(polhode.sense, polhode.A, polhode.B, polhode.r, polhode.s, polhode.m1)
     low, high = jnp.where(at_rest, 0, low), jnp.where(at_rest, math.pi, high)
@@ -191,7 +193,7 @@ def _periods_rule(primals, tangents):
     if arguments[1] is not None:
         moments, products, omega = arguments
         arguments = moments, products, omega, None, None
-        (*arguments, _, _), dm, dp, dw, _ = along_turning_axes(arguments, dm, dp, dw)
+        (*arguments, _, _), dm, dp, dw, _ = along_rotating_axes(arguments, dm, dp, dw)
     (values, mode), (polhode, precession, permanent, about) = _values_and_constants(arguments)
     P_psi, P_phi, k2, _, _ = values
     variation = start_variation(polhode, Frame(polhode), dm, dp, dw)

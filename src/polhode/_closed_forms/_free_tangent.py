@@ -229,7 +229,7 @@ def _off_diagonal_responses(
 
     q12, q13, q23 = l1 * l2, l1 * l3, l2 * l3
     swap = 1 + r * one_minus_N
-    turn = 1 + p * one_minus_C
+    factor = 1 + p * one_minus_C
     return (
         response(
             q12,
@@ -254,8 +254,8 @@ def _off_diagonal_responses(
             2 * p * q23 * square,
             (
                 sigma_pi * (l2 * l2 - l3 * l3) * S * N,
-                -l3 * N * one_minus_C - sigma_pi * q12 * S * turn,
-                -l2 * N * one_minus_C + sigma_pi * q13 * S * turn,
+                -l3 * N * one_minus_C - sigma_pi * q12 * S * factor,
+                -l2 * N * one_minus_C + sigma_pi * q13 * S * factor,
             ),
         ),
     )

@@ -51,14 +51,14 @@ from polhode._closed_forms._lagrange_series import Complex, Series
 from polhode._hamiltonian import components
 from polhode._kernels import (
     any_of,
-    attached,
     derivable_once,
-    is_slope,
+    is_nonzero_tangent,
     kernel,
     map_chunks,
     opaque_ones,
     spread,
     staged,
+    with_derivative_rule,
 )
 from polhode._scene import Scene, UniformGravity, Wheels
 
@@ -114,8 +114,8 @@ class LagrangeTop(AbstractChunkedForm):
         wxyz, omega = lagrange_motion(
             transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed
         )
-        holds = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
-        return wxyz, omega, holds & wheels_have_constant_momentum(scene, n)
+        is_valid = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
+        return wxyz, omega, is_valid & wheels_have_constant_momentum(scene, n)
 
 
 def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
@@ -172,14 +172,22 @@ def lagrange_motion(
     arguments: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
     constants = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
     angle = momentum_frequency(*constants)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
-    short = angle < short_angle(elapsed.dtype)
+    is_short = angle < short_angle(elapsed.dtype)
     # Derivatives of the closed form would be NaN for these bodies: it is evaluated for another
     # motion.
-    at_rest = jnp.all(short, axis=-1)[:, None]
+    at_rest = jnp.all(is_short, axis=-1)[:, None]
     weightless = jnp.all(force_space == 0, axis=-1, keepdims=True)
     force = jnp.where(at_rest | weightless, 0, force_space)
     start = jnp.where(at_rest, 1, omega)
-    other = transverse, force, distance, wxyz, start, axial_momentum, jnp.where(short, 0, elapsed)
+    other = (
+        transverse,
+        force,
+        distance,
+        wxyz,
+        start,
+        axial_momentum,
+        jnp.where(is_short, 0, elapsed),
+    )
     closed_form: Any = kernel(_long_motion, repeated=True)
     motion = closed_form(*other)
 
@@ -187,28 +195,28 @@ def lagrange_motion(
     # compilation of a gradient.
     def with_corrections(motion, arguments, elapsed):
         corrected: Any = kernel(_corrected, repeated=True)
-        lanes = list(motion), arguments, elapsed, short, weightless, at_rest
+        lanes = list(motion), arguments, elapsed, is_short, weightless, at_rest
         return map_chunks(lambda lane: corrected(*lane), lanes, elapsed.shape[0], 1)
 
     def unchanged(motion, arguments, elapsed):
         return list(motion)
 
-    branch = any_of(jnp.where(short | weightless, 1, 0))
+    branch = any_of(jnp.where(is_short | weightless, 1, 0))
     wxyz, omega = jax.lax.cond(branch, with_corrections, unchanged, motion, arguments, elapsed)
     return wxyz, omega
 
 
-def _corrected(motion, arguments: Any, elapsed, short, weightless, at_rest) -> Any:
+def _corrected(motion, arguments: Any, elapsed, is_short, weightless, at_rest) -> Any:
     """The motion with the two cases that the closed form lacks: see ``lagrange_motion``."""
     transverse, force, distance, wxyz, omega, axial = arguments
-    small = short_motion(
-        transverse, force, distance, wxyz, omega, axial, jnp.where(short, elapsed, 0)
+    short_samples = short_motion(
+        transverse, force, distance, wxyz, omega, axial, jnp.where(is_short, elapsed, 0)
     )
     corrected_motion = with_weight(
         transverse, force, distance, wxyz, omega, axial, elapsed, motion, weightless & ~at_rest
     )
     motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(corrected_motion, motion)]
-    return [jnp.where(short[..., None], x, y) for x, y in zip(small, motion)]
+    return [jnp.where(is_short[..., None], x, y) for x, y in zip(short_samples, motion)]
 
 
 def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum, elapsed):
@@ -344,13 +352,13 @@ def with_weight(
 
     # The changes are zero, and computed only in programs that differentiate by the force.
     def rule(operands, tangents, values):
-        if not is_slope(tangents[0]):
+        if not is_nonzero_tangent(tangents[0]):
             return [jnp.zeros_like(x) for x in values]
         along = jax.jvp(lambda f: _first_order(f, *operands[1:]), operands[:1], tangents[:1])
         return along[1]
 
     operands = [force, transverse, distance, wxyz, omega, axial, elapsed, *motion, applies]
-    changes = attached(rule, operands, [jnp.zeros_like(x) for x in motion])
+    changes = with_derivative_rule(rule, operands, [jnp.zeros_like(x) for x in motion])
     return [x + change for x, change in zip(motion, changes)]
 
 

@@ -13,13 +13,20 @@ from polhode import _integrate  # its names load diffrax at first use
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._events._event import Event, at_least, require_bodies
-from polhode._events._search import Brackets, Looks, entries, first_true, minima_of, searched
-from polhode._kernels import attached_to
+from polhode._events._search import (
+    Brackets,
+    Evaluation,
+    entries,
+    first_true,
+    minima_of,
+    search_roots,
+)
+from polhode._kernels import with_derivatives_of
 from polhode._method import Status
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory, moved_through, moved_to, with_initial_spins
 
-SAMPLES_PER_TURN = 32
+SAMPLES_PER_REVOLUTION = 32
 """Samples per revolution at the fastest natural rate."""
 
 _MAX_SAMPLES = 20_000_000
@@ -28,7 +35,7 @@ _MAX_SAMPLES = 20_000_000
 _MIN_CAPACITY = 16
 """Minimum number of turning points of the function that can be examined."""
 
-_SAMPLING_LOOKS = 64
+_SAMPLING_EVALUATIONS = 64
 """Maximum number of evaluations of the motion in which all samples are computed. Roots take about
 16 evaluations with the same number of times."""
 
@@ -213,10 +220,13 @@ def _sample_count(trajectory: Trajectory) -> int:
         )
     angle = np.max(np.asarray(_max_angle(trajectory)), initial=0)
     size = max(
-        17, 1 + int(np.ceil(SAMPLES_PER_TURN * angle / (2 * np.pi))) if np.isfinite(angle) else 17
+        17,
+        1 + int(np.ceil(SAMPLES_PER_REVOLUTION * angle / (2 * np.pi)))
+        if np.isfinite(angle)
+        else 17,
     )
-    tolerance = 2 ** max(0, int(np.log2(size)) - 2)  # few sizes, for few compiled programs
-    size = 1 + -(-(size - 1) // tolerance) * tolerance
+    multiple = 2 ** max(0, int(np.log2(size)) - 2)  # few sizes, for few compiled programs
+    size = 1 + -(-(size - 1) // multiple) * multiple
     if size * max(1, int(np.prod(trajectory.batch_shape))) > _MAX_SAMPLES:
         raise ValueError(
             f"{size:,} samples of each body are needed for the {angle:.3g} rad that it turns:"
@@ -230,11 +240,11 @@ def _max_angle(trajectory: Trajectory) -> Array:
     """Upper bound (...) of the angle of rotation from the first to the last time [rad]."""
     ts = trajectory._t
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
-    rate = jnp.max(turning_rates(trajectory), axis=-1)
+    rate = jnp.max(max_angular_rates(trajectory), axis=-1)
     return jnp.maximum(rate, _natural_rates(trajectory)) * span
 
 
-def turning_rates(trajectory: Trajectory) -> Array:
+def max_angular_rates(trajectory: Trajectory) -> Array:
     """Upper bound (..., T) of the rate of a body, by its momentum at each sample [rad/s]."""
     carrier = trajectory._scene.carrier_at(trajectory._t)
     size = jnp.linalg.norm(carrier.momentum(trajectory.omega_body), axis=-1)
@@ -250,7 +260,7 @@ def _natural_rates(trajectory: Trajectory) -> Array:
     return _integrate.natural_rates(Scene(**parts), lanes, ends).reshape(batch)
 
 
-class Met(NamedTuple):
+class EventCrossings(NamedTuple):
     """Crossings of E events, their states, and the bodies (...) that could not be sampled."""
 
     crossings: list[Crossings]
@@ -258,19 +268,21 @@ class Met(NamedTuple):
     has_failed: Array
 
 
-def all_crossings(trajectory: Trajectory, events: Sequence[Event], capacity: int) -> Met:
+def all_crossings(trajectory: Trajectory, events: Sequence[Event], capacity: int) -> EventCrossings:
     """The first ``capacity`` crossings of each event in one search of a concrete trajectory."""
     _propagator(trajectory)
     sizes = [event.samples for event in events]
     default = _sample_count(trajectory) if None in sizes else 2
     size = max(default if x is None else x for x in sizes)
-    met = _by_sampling(trajectory, events, capacity, size)
-    _raise_if_failed(met.has_failed, f"while {size:,} samples were computed")
-    return met
+    event_crossings = _by_sampling(trajectory, events, capacity, size)
+    _raise_if_failed(event_crossings.has_failed, f"while {size:,} samples were computed")
+    return event_crossings
 
 
 @eqx.filter_jit
-def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int, size: int) -> Met:
+def _by_sampling(
+    trajectory: Trajectory, events: Sequence[Event], capacity: int, size: int
+) -> EventCrossings:
     """The first ``capacity`` crossings of each event."""
     stop_gradient = jax.lax.stop_gradient
     arrays, static = eqx.partition(trajectory, eqx.is_inexact_array)
@@ -286,40 +298,42 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
     direction = jnp.asarray([event.direction for event in events], grid.dtype)
     direction = jnp.repeat(direction, grid.shape[0])[:, None]
 
-    def looks(moved: Trajectory) -> Looks:
-        pairs = [event.values(moved) for event in events]
-        values, slopes = (
+    def evaluation_of(evaluated: Trajectory) -> Evaluation:
+        pairs = [event.values(evaluated) for event in events]
+        values, derivatives = (
             jnp.stack(x).reshape(len(events), -1, x[0].shape[-1]) for x in zip(*pairs)
         )
-        states = [x.reshape(-1, *x.shape[rank:]) for x in moved._samples]
-        is_successful = jnp.ravel(moved.status == Status.SUCCESSFUL)
-        return stop_gradient(Looks(values, slopes, states, is_successful))
+        states = [x.reshape(-1, *x.shape[rank:]) for x in evaluated._samples]
+        is_successful = jnp.ravel(evaluated.status == Status.SUCCESSFUL)
+        return stop_gradient(Evaluation(values, derivatives, states, is_successful))
 
     origin, samples = constant_trajectory, None
     if not _propagator(trajectory).method.exact:  # integrated from the nearest sample
         origin = moved_through(constant_trajectory, times)
-        samples = looks(origin)._replace(states=[])
+        samples = evaluation_of(origin)._replace(states=[])
 
-    def look(t):
-        return looks(moved_to(origin, t.reshape(*batch, -1)))
+    def evaluate(t):
+        return evaluation_of(moved_to(origin, t.reshape(*batch, -1)))
 
     def analyse(samples):
         """The first intervals between samples in which the function changes its sign, the first in
         which it may do so twice, and the numbers of both."""
-        values, slopes = (x.reshape(-1, size) for x in (samples.values, samples.slopes))
+        values, derivatives = (x.reshape(-1, size) for x in (samples.values, samples.derivatives))
         sides = jnp.where(values >= 0, 1, -1)
         changes = sides[:, 1:] != sides[:, :-1]
         changes = changes & ((direction == 0) | (sides[:, 1:] * time_sign == direction))
-        minima = minima_of(rows, values, slopes, sides)
+        minima = minima_of(rows, values, derivatives, sides)
         counts = (jnp.sum(x, axis=-1) for x in (changes, minima))
         return first_true(changes, stored), first_true(minima, stored), *counts
 
     rows = jnp.tile(grid, (len(events), 1))
     stored = max(capacity, _MIN_CAPACITY)
 
-    def turns(samples, analysis):
-        slopes, (_, (place, is_minimum), *_) = samples.slopes.reshape(-1, size), analysis
-        low, high, at_low, at_high = (entries(x, place + k) for x in (rows, slopes) for k in (0, 1))
+    def turning_brackets(samples, analysis):
+        derivatives, (_, (place, is_minimum), *_) = samples.derivatives.reshape(-1, size), analysis
+        low, high, at_low, at_high = (
+            entries(x, place + k) for x in (rows, derivatives) for k in (0, 1)
+        )
         return Brackets(low, high, at_low, at_high, is_minimum)
 
     def brackets(samples, analysis, turning, turning_values):
@@ -347,9 +361,19 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
         count = jnp.where(dipping > stored, jnp.maximum(count, per_pair * dipping), count)
         return Brackets(*(entries(x, order) for x in (*columns, use))), count
 
-    width = max(len(events) * stored, -(-size // _SAMPLING_LOOKS))
-    found = searched(look, grid, stored, width, analyse, turns, brackets, samples, keep=False)
-    has_failed = ~found.samples.is_successful.reshape(batch)
+    width = max(len(events) * stored, -(-size // _SAMPLING_EVALUATIONS))
+    result = search_roots(
+        evaluate,
+        grid,
+        stored,
+        width,
+        analyse,
+        turning_brackets,
+        brackets,
+        samples,
+        store_states=False,
+    )
+    has_failed = ~result.samples.is_successful.reshape(batch)
     has_failed = has_failed & (trajectory.status == Status.SUCCESSFUL)
 
     def of_event(x, k):
@@ -357,27 +381,31 @@ def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int,
 
     crossings, states = [], []
     for k, event in enumerate(events):
-        times, use = (of_event(x, k)[..., :capacity] for x in (found.roots, found.use))
-        slope = of_event(found.slopes, k)[..., :capacity]
-        at_events = [of_event(x, k)[..., :capacity, :] for x in found.states]
+        times, use = (of_event(x, k)[..., :capacity] for x in (result.roots, result.use))
+        slope = of_event(result.derivatives, k)[..., :capacity]
+        at_events = [of_event(x, k)[..., :capacity, :] for x in result.states]
         slope, times, at_events = _differentiable(trajectory, event, times, use, slope, at_events)
-        total = jnp.where(has_failed, capacity + 1, of_event(found.beside, k)).astype(jnp.int32)
+        total = jnp.where(has_failed, capacity + 1, of_event(result.auxiliary, k)).astype(jnp.int32)
         times, slope = jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0)
         crossings.append(Crossings(times, slope, total))
         states.append(at_events)
-    return Met(crossings, states, has_failed)
+    return EventCrossings(crossings, states, has_failed)
 
 
 def _differentiable(trajectory: Trajectory, event: Event, times, use, slope, states):
     """Derivatives of the function by time, times, and states at events, with their derivatives."""
-    safe = jnp.where(use, times, jax.lax.stop_gradient(trajectory.ts[..., :1]))
+    finite_times = jnp.where(use, times, jax.lax.stop_gradient(trajectory.ts[..., :1]))
     arrays, static = eqx.partition(trajectory, eqx.is_inexact_array)
 
-    def refined(arrays, safe):
+    def refined(arrays, finite_times):
         # The correction is limited to rounding: at a tangency (double root) it would be noise.
-        tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
-        delay, at_events = event.refined(moved_to(eqx.combine(arrays, static), safe), tolerance)
-        return [event.values(at_events)[1], safe + delay, *at_events._samples]
+        tolerance = 64 * jnp.finfo(finite_times.dtype).eps * jnp.abs(finite_times)
+        delay, at_events = event.refined(
+            moved_to(eqx.combine(arrays, static), finite_times), tolerance
+        )
+        return [event.values(at_events)[1], finite_times + delay, *at_events._samples]
 
-    slope, times, *states = attached_to(refined, (arrays, safe), [slope, safe, *states])
+    slope, times, *states = with_derivatives_of(
+        refined, (arrays, finite_times), [slope, finite_times, *states]
+    )
     return slope, times, states

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._kernels import attached_to
+from polhode._kernels import with_derivatives_of
 from polhode._parts import Signature
 from polhode._trajectory import Trajectory, shortly_after
 from polhode.rotation._quaternion import wxyz_rate
@@ -70,8 +70,8 @@ class Event(eqx.Module):
         if rates is None:
             acceleration = trajectory._scene.acceleration(wxyz, omega, trajectory._t)
             rates = [wxyz_rate(wxyz, omega), acceleration]
-        slopes = (*rates[:2], jnp.ones_like(t))
-        return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
+        tangents = (*rates[:2], jnp.ones_like(t))
+        return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), tangents)
 
     def differentiable_at(
         self, approximate: Trajectory, limit: Array, side: Array
@@ -86,7 +86,7 @@ class Event(eqx.Module):
             return [delay, *at_events._samples]
 
         values = [jnp.zeros_like(approximate._t), *approximate._samples]
-        delay, *states = attached_to(values_of, (arrays, limit, side), values)
+        delay, *states = with_derivatives_of(values_of, (arrays, limit, side), values)
         at_events = approximate._with_samples(
             approximate._t + delay, states, approximate.status, approximate._steps, None
         )
@@ -107,16 +107,16 @@ class Event(eqx.Module):
         """
         stop_gradient = jax.lax.stop_gradient
         shift = None if side is None else self._towards(approximate, side)
-        rates, later = shortly_after(approximate, shift)
-        value, slope = self.values(approximate, rates)
-        touch, chord = slope == 0, stop_gradient(jnp.where(slope == 0, 1, slope))
-        delay = jnp.where(touch, 0, -value / chord)
+        rates, moved_by = shortly_after(approximate, shift)
+        value, rate = self.values(approximate, rates)
+        is_tangent, nonzero_rate = rate == 0, stop_gradient(jnp.where(rate == 0, 1, rate))
+        delay = jnp.where(is_tangent, 0, -value / nonzero_rate)
         delay = delay - stop_gradient(delay) + stop_gradient(jnp.clip(delay, -limit, limit))
-        at_delay = later(delay)
+        at_delay = moved_by(delay)
         value = _FUNCTION.mapped(self.fn, at_delay.wxyz, at_delay.omega_body, at_delay._t)
-        change = jnp.where(touch, 0, -value / chord)
+        change = jnp.where(is_tangent, 0, -value / nonzero_rate)
         delay = _differentiable(delay + (change - stop_gradient(change)), 2)
-        return delay, later(delay)
+        return delay, moved_by(delay)
 
     def _towards(self, trajectory: Trajectory, side: Array) -> list[Array]:
         """Changes of attitude, rates and time by some units in the last place, from the surface
@@ -134,14 +134,14 @@ class Event(eqx.Module):
         def total(*point):
             return jnp.sum(_FUNCTION.mapped(self.fn, *point))
 
-        slopes = jax.grad(total, argnums=(0, 1, 2))(wxyz, omega, t)
-        slopes = [x * unit for x, unit in zip(slopes, units, strict=True)]
-        square = slopes[2] ** 2 + sum(jnp.sum(x * x, axis=-1) for x in slopes[:2])
-        reach = _TOWARDS * jnp.finfo(t.dtype).eps * side
-        reach = reach * jax.lax.rsqrt(jnp.where(square > 0, square, 1))
-        *vectors, change = (x * unit for x, unit in zip(slopes, units, strict=True))
-        moves = [reach[..., None] * x for x in vectors] + [reach * change]
-        return [jax.lax.stop_gradient(x) for x in moves]
+        gradient = jax.grad(total, argnums=(0, 1, 2))(wxyz, omega, t)
+        gradient = [x * unit for x, unit in zip(gradient, units, strict=True)]
+        square = gradient[2] ** 2 + sum(jnp.sum(x * x, axis=-1) for x in gradient[:2])
+        distance = _TOWARDS * jnp.finfo(t.dtype).eps * side
+        distance = distance * jax.lax.rsqrt(jnp.where(square > 0, square, 1))
+        *vectors, change = (x * unit for x, unit in zip(gradient, units, strict=True))
+        displacements = [distance[..., None] * x for x in vectors] + [distance * change]
+        return [jax.lax.stop_gradient(x) for x in displacements]
 
 
 _TOWARDS = 256

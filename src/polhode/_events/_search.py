@@ -3,7 +3,6 @@
 A motion in closed form takes long to compile, so that the program of a search contains it once. The
 samples, the turning points between them, the roots, and the states at the roots are passes of one
 loop. Each iteration evaluates the motion at some times, and the results determine the next times.
-One such evaluation is called a *look* in names.
 """
 
 from collections.abc import Callable
@@ -15,19 +14,19 @@ from jaxtyping import Array
 
 from polhode._kernels import kernel
 
-_SAMPLES, _TURNS, _ROOTS, _STATES = range(4)
+_SAMPLES, _TURNING_POINTS, _ROOTS, _STATES = range(4)
 """The passes of the loop."""
 
-_MAX_LOOKS = 100
+_MAX_EVALUATIONS = 100
 """Maximum number of evaluations for one root: bisection alone would need about sixty."""
 
 
-class Looks(NamedTuple):
-    """N bodies at times (N, W): values and time derivatives (``slopes``) (E, N, W) of E functions,
+class Evaluation(NamedTuple):
+    """N bodies at times (N, W): ``values`` and time ``derivatives`` (E, N, W) of E functions,
     states (N, W, ...), and whether the motion of each body (N,) was computed successfully."""
 
     values: Array
-    slopes: Array
+    derivatives: Array
     states: list[Array]
     is_successful: Array
 
@@ -43,43 +42,43 @@ class Brackets(NamedTuple):
     use: Array
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """Samples; roots (E N, K), which entries are used, and the second result of ``brackets``; time
     derivatives at the roots, and the states (E N, K, ...)."""
 
-    samples: Looks
+    samples: Evaluation
     roots: Array
     use: Array
-    beside: Any
-    slopes: Array
+    auxiliary: Any
+    derivatives: Array
     states: list[Array]
 
 
-def searched(
-    look: Callable[[Array], Looks],
+def search_roots(
+    evaluate: Callable[[Array], Evaluation],
     grid: Array,
     columns: int,
     width: int,
-    analyse: Callable[[Looks], Any],
-    turns: Callable[[Looks, Any], Brackets],
-    brackets: Callable[[Looks, Any, Array, Array], tuple[Brackets, Any]],
-    samples: Looks | None = None,
-    keep: bool = True,
-) -> Found:
+    analyse: Callable[[Evaluation], Any],
+    turning_brackets: Callable[[Evaluation, Any], Brackets],
+    brackets: Callable[[Evaluation, Any, Array, Array], tuple[Brackets, Any]],
+    samples: Evaluation | None = None,
+    store_states: bool = True,
+) -> SearchResult:
     """Samples at the times ``grid`` (N, S), and the roots between them.
 
-    - ``look``: evaluates the motion at times (N, W), W = ``width`` or more, and at least E K.
+    - ``evaluate``: evaluates the motion at times (N, W), W = ``width`` or more, and at least E K.
     - ``analyse(samples)``: the analysis of all samples, made once.
-    - ``turns(samples, analysis)``: brackets of the zeros of the time derivatives.
+    - ``turning_brackets(samples, analysis)``: brackets of the zeros of the time derivatives.
     - ``brackets(samples, analysis, turning, turning_values)``: brackets of the zeros of the
       functions, for these turning points and the values there, and any other result. Both return
       K = ``columns`` entries.
-    - ``samples``: those at ``grid``, if they are available without ``look``.
-    - ``keep``: whether the samples include the states.
+    - ``samples``: those at ``grid``, if they are available without ``evaluate``.
+    - ``store_states``: whether the samples include the states.
     """
     (n, size), is_sampled = grid.shape, samples is not None
-    blank = _blank(look, jnp.broadcast_to(grid[:, :1], (n, width)))
-    rows = blank.values.shape[0]
+    ones = _ones_like(evaluate, jnp.broadcast_to(grid[:, :1], (n, width)))
+    rows = ones.values.shape[0]
     assert width >= rows * columns
     chunks = -(-size // width)
     padded = jnp.pad(grid, ((0, 0), (0, chunks * width - size)), mode="edge")
@@ -97,87 +96,106 @@ def searched(
         return own.reshape(rows * n, columns, *x.shape[4:])
 
     def one_pass(carry, number):
-        store, analysis, points, point_values, seen, use = carry
-        is_sampling, is_turning, is_last = (number == k for k in (_SAMPLES, _TURNS, _STATES))
-        known = _cut(store, size)
+        store, analysis, points, point_values, evaluation, use = carry
+        is_sampling, is_turning, is_last = (
+            number == k for k in (_SAMPLES, _TURNING_POINTS, _STATES)
+        )
+        all_samples = _first_samples(store, size)
         if not is_sampled:
-            analysis = jax.lax.cond(is_turning, analyse, lambda _: analysis, known)
-        of_roots, beside = brackets(known, analysis, points, point_values)
-        problems = turns(known, analysis), of_roots
-        walk = _walk_between(*(jnp.where(is_turning, a, b) for a, b in zip(*problems)))
-        limit = jnp.where(is_sampling, chunks, jnp.where(is_last, 1, _MAX_LOOKS))
+            analysis = jax.lax.cond(is_turning, analyse, lambda _: analysis, all_samples)
+        of_roots, auxiliary = brackets(all_samples, analysis, points, point_values)
+        problems = turning_brackets(all_samples, analysis), of_roots
+        bracket = _bracket_between(*(jnp.where(is_turning, a, b) for a, b in zip(*problems)))
+        limit = jnp.where(is_sampling, chunks, jnp.where(is_last, 1, _MAX_EVALUATIONS))
 
-        def on(loop):
-            count, walk, *_ = loop
-            wanted = jnp.where(is_last, jnp.any(use), ~jnp.all(walk.is_done))
-            return (count < limit) & (is_sampling | wanted)
+        def continues(loop):
+            count, bracket, *_ = loop
+            is_unfinished = jnp.where(is_last, jnp.any(use), ~jnp.all(bracket.is_done))
+            return (count < limit) & (is_sampling | is_unfinished)
 
         def iterate(loop):
-            count, walk, store, _ = loop
-            t = of_bodies(jnp.where(is_last, points, walk.next))
+            count, bracket, store, _ = loop
+            t = of_bodies(jnp.where(is_last, points, bracket.next))
             if not is_sampled:
                 start = jnp.where(is_sampling, count, 0) * width
                 part = jax.lax.dynamic_slice_in_dim(padded, start, width, axis=1)
                 t = jnp.where(is_sampling, part, t)
-            seen = look(t)
+            evaluation = evaluate(t)
             if not is_sampled:
-                store = _written(store, seen, start, is_sampling)
-            values, slopes = of_rows(seen.values), of_rows(seen.slopes)
-            walk = kernel(_next)(walk, jnp.where(is_turning, slopes, values), values)
-            return count + 1, walk, store, seen
+                store = _with_samples(store, evaluation, start, is_sampling)
+            values, derivatives = of_rows(evaluation.values), of_rows(evaluation.derivatives)
+            bracket = kernel(_update)(bracket, jnp.where(is_turning, derivatives, values), values)
+            return count + 1, bracket, store, evaluation
 
-        loop = jnp.zeros((), jnp.int32), walk, store, seen
-        _, walk, store, seen = jax.lax.while_loop(on, iterate, loop)
-        points = jnp.where(is_last, points, _root(walk))
-        return (store, analysis, points, walk.value, seen, of_roots.use), (of_roots.use, beside)
+        loop = jnp.zeros((), jnp.int32), bracket, store, evaluation
+        _, bracket, store, evaluation = jax.lax.while_loop(continues, iterate, loop)
+        points = jnp.where(is_last, points, _root(bracket))
+        return (store, analysis, points, bracket.value, evaluation, of_roots.use), (
+            of_roots.use,
+            auxiliary,
+        )
 
     store = samples
     if store is None:
-        store = _repeated(blank, chunks, keep)
+        store = _sample_storage(ones, chunks, store_states)
     zeros = jnp.zeros((rows * n, columns), grid.dtype)
-    passes = (_SAMPLES, _TURNS, _ROOTS, _STATES)[is_sampled:]
-    analysis = analyse(_cut(store, size)) if is_sampled else _blank(analyse, _cut(store, size))
-    carry = store, analysis, zeros, zeros.astype(store.values.dtype), blank, zeros > 0
-    (store, _, roots, _, seen, _), of_passes = jax.lax.scan(one_pass, carry, jnp.array(passes))
-    use, beside = jax.tree.map(lambda x: x[-2], of_passes)  # of the roots
-    states = [of_rows(jnp.broadcast_to(x, (rows, *x.shape))) for x in seen.states]
-    return Found(_cut(store, size), roots, use, beside, of_rows(seen.slopes), states)
+    passes = (_SAMPLES, _TURNING_POINTS, _ROOTS, _STATES)[is_sampled:]
+    analysis = (
+        analyse(_first_samples(store, size))
+        if is_sampled
+        else _ones_like(analyse, _first_samples(store, size))
+    )
+    carry = (store, analysis, zeros, zeros.astype(store.values.dtype), ones, zeros > 0)
+    (store, _, roots, _, evaluation, _), of_passes = jax.lax.scan(
+        one_pass, carry, jnp.array(passes)
+    )
+    use, auxiliary = jax.tree.map(lambda x: x[-2], of_passes)  # of the roots
+    states = [of_rows(jnp.broadcast_to(x, (rows, *x.shape))) for x in evaluation.states]
+    return SearchResult(
+        _first_samples(store, size), roots, use, auxiliary, of_rows(evaluation.derivatives), states
+    )
 
 
-def _blank(function: Callable, argument: Any) -> Any:
+def _ones_like(function: Callable, argument: Any) -> Any:
     """Ones with the shapes and dtypes of the function's results."""
     return jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), jax.eval_shape(function, argument))
 
 
-def _repeated(looks: Looks, count: int, keep: bool) -> Looks:
+def _sample_storage(evaluation: Evaluation, count: int, store_states: bool) -> Evaluation:
     """Arrays to store the results of ``count`` evaluations one after another."""
-    values, slopes = (jnp.tile(x, (1, 1, count)) for x in (looks.values, looks.slopes))
-    states = [jnp.tile(x, (1, count, 1)) for x in looks.states] if keep else []
-    return Looks(values, slopes, states, looks.is_successful)
+    values, derivatives = (
+        jnp.tile(x, (1, 1, count)) for x in (evaluation.values, evaluation.derivatives)
+    )
+    states = [jnp.tile(x, (1, count, 1)) for x in evaluation.states] if store_states else []
+    return Evaluation(values, derivatives, states, evaluation.is_successful)
 
 
-def _cut(store: Looks, size: int) -> Looks:
+def _first_samples(store: Evaluation, size: int) -> Evaluation:
     states = [x[:, :size] for x in store.states]
-    return Looks(store.values[..., :size], store.slopes[..., :size], states, store.is_successful)
-
-
-def _written(store: Looks, seen: Looks, start: Array, is_sampling: Array) -> Looks:
-    """The samples with the new ones stored from index ``start`` on, if this is the first pass."""
-
-    def put(old, new, axis):
-        there = jax.lax.dynamic_slice_in_dim(old, start, new.shape[axis], axis)
-        new = jnp.where(is_sampling, new, there)
-        return jax.lax.dynamic_update_slice_in_dim(old, new, start, axis)
-
-    return Looks(
-        put(store.values, seen.values, 2),
-        put(store.slopes, seen.slopes, 2),
-        [put(x, y, 1) for x, y in zip(store.states, seen.states)],
-        store.is_successful & (seen.is_successful | ~is_sampling),
+    return Evaluation(
+        store.values[..., :size], store.derivatives[..., :size], states, store.is_successful
     )
 
 
-class _Walk(NamedTuple):
+def _with_samples(
+    store: Evaluation, evaluation: Evaluation, start: Array, is_sampling: Array
+) -> Evaluation:
+    """The samples with the new ones stored from index ``start`` on, if this is the first pass."""
+
+    def with_new(old, new, axis):
+        stored = jax.lax.dynamic_slice_in_dim(old, start, new.shape[axis], axis)
+        new = jnp.where(is_sampling, new, stored)
+        return jax.lax.dynamic_update_slice_in_dim(old, new, start, axis)
+
+    return Evaluation(
+        with_new(store.values, evaluation.values, 2),
+        with_new(store.derivatives, evaluation.derivatives, 2),
+        [with_new(x, y, 1) for x, y in zip(store.states, evaluation.states)],
+        store.is_successful & (evaluation.is_successful | ~is_sampling),
+    )
+
+
+class _RootBracket(NamedTuple):
     """The search for a root between the times ``x1``, evaluated last, and ``x2``: the function
     there, the next time to evaluate, the tolerance, and another value at the last time."""
 
@@ -191,46 +209,51 @@ class _Walk(NamedTuple):
     value: Array
 
 
-def _walk_between(low: Array, high: Array, at_low: Array, at_high: Array, use: Array) -> _Walk:
+def _bracket_between(
+    low: Array, high: Array, at_low: Array, at_high: Array, use: Array
+) -> _RootBracket:
     zero = at_low == 0
     x1, f1 = jnp.where(zero, low, high), jnp.where(zero, at_low, at_high)
     is_done = ~use | zero | (at_high == 0)
     tolerance = 2 * jnp.finfo(low.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
     middle = jnp.where(is_done, x1, x1 + (low - x1) / 2)
-    return _Walk(is_done, x1, low, f1, at_low, middle, tolerance, jnp.zeros_like(at_low))
+    return _RootBracket(is_done, x1, low, f1, at_low, middle, tolerance, jnp.zeros_like(at_low))
 
 
-def _next(walk: _Walk, f: Array, value: Array) -> _Walk:
-    """The search after an evaluation at ``walk.next``, where the function is ``f``.
+def _update(bracket: _RootBracket, f: Array, value: Array) -> _RootBracket:
+    """The search after an evaluation at ``bracket.next``, where the function is ``f``.
 
     Inverse quadratic interpolation where it is safe, bisection elsewhere: T. R. Chandrupatla, Adv.
     Eng. Software 28 (1997) 145; to a few units in the last place of the larger time.
     """
-    is_done, x1, x2, f1, f2, x, tolerance, _ = walk
+    is_done, x1, x2, f1, f2, x, tolerance, _ = bracket
     same_sign = jnp.sign(f) == jnp.sign(f1)
     x3, f3 = jnp.where(same_sign, x1, x2), jnp.where(same_sign, f1, f2)
     new2, g2 = jnp.where(same_sign, x2, x1), jnp.where(same_sign, f2, f1)
-    bracket = jnp.abs(new2 - x)
-    limit = tolerance / jnp.where(bracket > 0, bracket, 1)
-    stop = (bracket <= 2 * tolerance) | (f == 0)
+    width = jnp.abs(new2 - x)
+    limit = tolerance / jnp.where(width > 0, width, 1)
+    is_converged = (width <= 2 * tolerance) | (f == 0)
     a, b, c = f - g2, f3 - g2, f3 - f
     ab, ac, bc = (jnp.where(z == 0, 1, z) for z in (a, c, b))
-    across = jnp.where(x3 == new2, 1, x3 - new2)
-    xi, phi = (x - new2) / across, a / bc
-    safe = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
+    denominator = jnp.where(x3 == new2, 1, x3 - new2)
+    xi, phi = (x - new2) / denominator, a / bc
+    is_safe = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
     span = jnp.where(new2 == x, 1, new2 - x)
     inverse = -(f / ab) * (-f3 / bc) + (x3 - x) / span * (f / ac) * (g2 / bc)
-    share = jnp.clip(jnp.where(safe, inverse, 0.5), limit, 1 - limit)
-    after = jnp.where(stop, x, x + share * (new2 - x))
-    new = stop, x, new2, f, g2, after, tolerance, value
-    return _Walk(is_done | stop, *(jnp.where(is_done, o, w) for o, w in zip(walk[1:], new[1:])))
+    share = jnp.clip(jnp.where(is_safe, inverse, 0.5), limit, 1 - limit)
+    next_time = jnp.where(is_converged, x, x + share * (new2 - x))
+    updated = is_converged, x, new2, f, g2, next_time, tolerance, value
+    return _RootBracket(
+        is_done | is_converged,
+        *(jnp.where(is_done, o, w) for o, w in zip(bracket[1:], updated[1:])),
+    )
 
 
-def _root(walk: _Walk) -> Array:
-    return jnp.where(jnp.abs(walk.f1) <= jnp.abs(walk.f2), walk.x1, walk.x2)
+def _root(bracket: _RootBracket) -> Array:
+    return jnp.where(jnp.abs(bracket.f1) <= jnp.abs(bracket.f2), bracket.x1, bracket.x2)
 
 
-def minima_of(grid, values, slopes, sides) -> Array:
+def minima_of(grid, values, derivatives, sides) -> Array:
     """Intervals between samples (N, S - 1) in which the function turns back before zero, close to
     it.
 
@@ -240,15 +263,15 @@ def minima_of(grid, values, slopes, sides) -> Array:
     step = grid[:, 1:] - grid[:, :-1]
     side = sides[:, :-1].astype(values.dtype)
     a, end = side * values[:, :-1], side * values[:, 1:]
-    b, b_end = side * step * slopes[:, :-1], side * step * slopes[:, 1:]
-    turns = (sides[:, 1:] == sides[:, :-1]) & (b < 0) & (b_end > 0)
+    b, b_end = side * step * derivatives[:, :-1], side * step * derivatives[:, 1:]
+    has_minimum = (sides[:, 1:] == sides[:, :-1]) & (b < 0) & (b_end > 0)
     jump = end - a
     c, d = 3 * jump - 2 * b - b_end, b + b_end - 2 * jump
     root = jnp.sqrt(jnp.maximum(c * c - 3 * d * b, 0))
     s = -b / jnp.where(c + root > 0, c + root, 1)
     s = jnp.clip(s, 0, 1)
     lowest = a + s * (b + s * (c + s * d))
-    return turns & (lowest <= jnp.minimum(a, end) / 2)
+    return has_minimum & (lowest <= jnp.minimum(a, end) / 2)
 
 
 def entries(x: Array, k: Array) -> Array:

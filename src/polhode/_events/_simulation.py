@@ -17,13 +17,20 @@ from polhode import _integrate, _policy  # names of _integrate load diffrax at f
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._events._crossings import (
     AT_START,
-    SAMPLES_PER_TURN,
-    Met,
+    SAMPLES_PER_REVOLUTION,
+    EventCrossings,
     all_crossings,
-    turning_rates,
+    max_angular_rates,
 )
 from polhode._events._event import Event
-from polhode._events._search import Brackets, Looks, entries, first_true, minima_of, searched
+from polhode._events._search import (
+    Brackets,
+    Evaluation,
+    entries,
+    first_true,
+    minima_of,
+    search_roots,
+)
 from polhode._failed import where_lost
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
@@ -143,41 +150,46 @@ def events_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Traject
 
 
 @eqx.filter_jit
-def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event]) -> Trajectory:
-    times, counts = ([getattr(x, name) for x in met.crossings] for name in ("times", "count"))
+def _in_order_of_time(
+    trajectory: Trajectory, result: EventCrossings, events: Sequence[Event]
+) -> Trajectory:
+    times, counts = ([getattr(x, name) for x in result.crossings] for name in ("times", "count"))
     batch, ts = trajectory.batch_shape, trajectory.ts
     rows = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
     sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)
     which = [jnp.full(x.shape, k, jnp.int32) for k, x in enumerate(times)]
-    at, which = (
+    event_times, which = (
         jnp.concatenate([y.reshape(rows.shape[0], -1) for y in x], axis=1) for x in (times, which)
     )
-    capacity = at.shape[1] // len(events)  # the total for each: all events may be of one kind
+    # the total for each: all events may be of one kind
+    capacity = event_times.shape[1] // len(events)
     states = [
         jnp.concatenate([y.reshape(rows.shape[0], -1, y.shape[-1]) for y in x], axis=1)
-        for x in zip(*met.states)
+        for x in zip(*result.states)
     ]
-    order = jnp.argsort(jnp.where(jnp.isfinite(at), sign * at, jnp.inf), axis=1)
-    at, which = (jnp.take_along_axis(x, order, axis=1) for x in (at, which))
+    order = jnp.argsort(jnp.where(jnp.isfinite(event_times), sign * event_times, jnp.inf), axis=1)
+    event_times, which = (jnp.take_along_axis(x, order, axis=1) for x in (event_times, which))
     states = [jnp.take_along_axis(x, order[..., None], axis=1) for x in states]
     # events after a terminal event are dropped
-    is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
-    stop = jnp.min(jnp.where(is_terminal, sign * at, jnp.inf), axis=1, keepdims=True)
-    at = jnp.where(sign * at > stop, jnp.inf, at)
-    happens = jnp.isfinite(at)
-    count = jnp.sum(happens, axis=1, dtype=jnp.int32)
-    for k, (found, total) in enumerate(zip(times, counts, strict=True)):
+    is_terminal = jnp.isfinite(event_times) & _is_terminal(which, events)
+    stop = jnp.min(jnp.where(is_terminal, sign * event_times, jnp.inf), axis=1, keepdims=True)
+    event_times = jnp.where(sign * event_times > stop, jnp.inf, event_times)
+    occurs = jnp.isfinite(event_times)
+    count = jnp.sum(occurs, axis=1, dtype=jnp.int32)
+    for k, (crossing_times, total) in enumerate(zip(times, counts, strict=True)):
         # events that were not stored come after the stored ones
-        listed = jnp.sum(jnp.isfinite(found.reshape(-1, capacity)), axis=1, dtype=count.dtype)
-        all_happen = jnp.sum(happens & (which == k), axis=1, dtype=count.dtype) == listed
-        more = jnp.ravel(total).astype(count.dtype) - listed
-        count = count + jnp.where(all_happen, jnp.maximum(more, 0), 0)
+        listed = jnp.sum(
+            jnp.isfinite(crossing_times.reshape(-1, capacity)), axis=1, dtype=count.dtype
+        )
+        all_happen = jnp.sum(occurs & (which == k), axis=1, dtype=count.dtype) == listed
+        unstored = jnp.ravel(total).astype(count.dtype) - listed
+        count = count + jnp.where(all_happen, jnp.maximum(unstored, 0), 0)
     overflows = (count > capacity).reshape(batch)
     # a terminal event is always stored: it is the end of the motion
     end = jnp.where(jnp.any(is_terminal, axis=1), jnp.argmax(is_terminal, axis=1), 0)
-    stored = jnp.broadcast_to(jnp.arange(capacity), (at.shape[0], capacity))
+    stored = jnp.broadcast_to(jnp.arange(capacity), (event_times.shape[0], capacity))
     stored = stored.at[:, -1].max(end)
-    at, which = (jnp.take_along_axis(x, stored, axis=1) for x in (at, which))
+    event_times, which = (jnp.take_along_axis(x, stored, axis=1) for x in (event_times, which))
     states = [jnp.take_along_axis(x, stored[..., None], axis=1) for x in states]
     status = jnp.where(
         (trajectory.status == Status.SUCCESSFUL) & overflows,
@@ -190,7 +202,7 @@ def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event])
         [x.reshape(-1, *x.shape[len(batch) :]) for x in trajectory._samples],
         jax.tree.map(jnp.ravel, (status, trajectory._steps)),
         events,
-        (at, which, count),
+        (event_times, which, count),
         states,
     )
 
@@ -203,35 +215,35 @@ def _is_terminal(which: Array, events: Sequence[Event]) -> Array:
 def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences, states):
     """The trajectory with its events; samples after a terminal event are those of the event."""
     batch = begin.batch_shape
-    at, which, count = occurrences
-    happens = jnp.isfinite(at)
-    which = jnp.where(happens, which, -1)
+    event_times, which, count = occurrences
+    occurs = jnp.isfinite(event_times)
+    which = jnp.where(occurs, which, -1)
     ending = None
     if any(event.terminal for event in events):
-        is_terminal = happens & _is_terminal(which, events)
+        is_terminal = occurs & _is_terminal(which, events)
         terminal_index = jnp.argmax(is_terminal, axis=1)[:, None]
         stops = jnp.any(is_terminal, axis=1, keepdims=True)
-        stop = jnp.take_along_axis(at, terminal_index, axis=1)
+        stop_time = jnp.take_along_axis(event_times, terminal_index, axis=1)
         sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(rows.dtype)
-        is_past = stops & (sign * rows >= sign * jnp.where(stops, stop, 0))
-        rows = jnp.where(is_past, stop, rows)
+        is_past = stops & (sign * rows >= sign * jnp.where(stops, stop_time, 0))
+        rows = jnp.where(is_past, stop_time, rows)
         path = [
             jnp.where(
                 is_past[..., None], jnp.take_along_axis(y, terminal_index[..., None], axis=1), x
             )
             for x, y in zip(path, states, strict=True)
         ]
-        event_time = jnp.where(stops, stop, jnp.inf)
+        event_time = jnp.where(stops, stop_time, jnp.inf)
         sign = jnp.broadcast_to(sign, event_time.shape)
         ending = Ending(event_time.reshape(batch), sign.reshape(batch))
     path = [x.reshape(*batch, *x.shape[1:]) for x in path]
     status, steps = jax.tree.map(lambda x: x.reshape(batch), outcome)
-    nothing = ~happens[..., None]
+    is_missing = ~occurs[..., None]
     attitudes, rates, *_ = (
-        jnp.where(nothing, jnp.nan, x).reshape(*batch, *x.shape[1:]) for x in states
+        jnp.where(is_missing, jnp.nan, x).reshape(*batch, *x.shape[1:]) for x in states
     )
     record = Events(
-        times=at.reshape(*batch, -1),
+        times=event_times.reshape(*batch, -1),
         which=which.reshape(*batch, -1),
         wxyz=attitudes,
         omega_body=rates,
@@ -295,11 +307,11 @@ def _stopped_by_windows(lanes: Trajectory, ts: Array, until: Event):
     arrays, static = eqx.partition((lanes, until), eqx.is_inexact_array)
     stop_gradient = jax.lax.stop_gradient
     constant_lanes, event = eqx.combine(stop_gradient(arrays), static)
-    has_event, gave_up, event_time, step = stop_gradient(
+    has_event, is_incomplete, event_time, step = stop_gradient(
         _first_event(constant_lanes, event, stop_gradient(ts))
     )
     path = _stopped_at(lanes, ts, until, has_event, event_time, step)
-    return (*path[:3], jnp.where(gave_up, Status.MAX_STEPS, path[3]), *path[4:])
+    return (*path[:3], jnp.where(is_incomplete, Status.MAX_STEPS, path[3]), *path[4:])
 
 
 def _of_lanes(begin: Trajectory) -> Trajectory:
@@ -364,7 +376,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         grid = start_time[..., None] + share * span[..., None]
         return jnp.where(share >= 1, end_time[..., None], grid)
 
-    def at(time, samples, share_of_error=None):
+    def trajectory_at(time, samples, share_of_error=None):
         """A trajectory of one sample at a time () or (N,). ``share_of_error``: part of ``rtol``
         for the motion from there on."""
         wxyz, omega, *spins = (x[:, None] for x in samples)
@@ -386,108 +398,124 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             propagator=limited_propagator,
         )
 
-    def width_by_rate(share, samples, busy):
+    def width_by_rate(share, samples, active):
         if until.samples is not None:
             return jnp.asarray(_SAMPLES / (until.samples - 1), dtype)
         time_range = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], end_time), axis=-1)
         rates = _integrate.natural_rates(lanes.scene, State(*samples[:2]), time_range)
-        angle = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
-        angle = jnp.maximum(angle, jnp.finfo(dtype).tiny)
-        return jnp.maximum(_SAMPLES * 2 * jnp.pi / SAMPLES_PER_TURN / angle, min_width).astype(
-            dtype
+        angle = jnp.max(
+            jnp.where(active & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0
         )
+        angle = jnp.maximum(angle, jnp.finfo(dtype).tiny)
+        return jnp.maximum(
+            _SAMPLES * 2 * jnp.pi / SAMPLES_PER_REVOLUTION / angle, min_width
+        ).astype(dtype)
 
     def search_window(carry: _Window) -> _Window:
-        busy = ~carry.has_event & carry.is_successful
+        active = ~carry.has_event & carry.is_successful
         width = jnp.minimum(carry.width, 1 - carry.share)
-        part = jnp.linspace(0, 1, _SAMPLES + 1, dtype=dtype)
+        fractions = jnp.linspace(0, 1, _SAMPLES + 1, dtype=dtype)
         offset = jnp.where(carry.share == 0, AT_START / _SAMPLES, 0).astype(dtype)
-        share = carry.share + width * part.at[0].set(offset)
+        share = carry.share + width * fractions.at[0].set(offset)
         share = share.at[-1].set(jnp.where(width < carry.width, 1, share[-1]))
-        begin = lanes if exact else at(times(carry.share[None])[..., 0], carry.samples, width)
+        begin = (
+            lanes
+            if exact
+            else trajectory_at(times(carry.share[None])[..., 0], carry.samples, width)
+        )
         sampled = None if exact else moved_through(begin, times(share))
         grid = jnp.broadcast_to(times(share), (n, _SAMPLES + 1))
         intervals = jnp.arange(_SAMPLES)
 
-        def looks(moved: Trajectory) -> Looks:
-            values, slopes = until.values(moved)
-            is_successful = moved.status == Status.SUCCESSFUL
-            return Looks(values[None], slopes[None], moved._samples, is_successful)
+        def evaluation_of(trajectory: Trajectory) -> Evaluation:
+            values, derivatives = until.values(trajectory)
+            is_successful = trajectory.status == Status.SUCCESSFUL
+            return Evaluation(values[None], derivatives[None], trajectory._samples, is_successful)
 
-        def analyse(seen: Looks):
+        def analyse(evaluation: Evaluation):
             """The first change of sign (N,), the turning points, and the index up to which the
             samples are valid: to where a body rotates too fast for them, or to a turning point
             beyond the number that is examined.
             """
-            values, slopes = seen.values[0], seen.slopes[0]
+            values, derivatives = evaluation.values[0], evaluation.derivatives[0]
             sides = jnp.where(values >= 0, 1, -1)
             changes = sides[:, 1:] != sides[:, :-1]
             if until.direction:
                 changes = changes & (sides[:, 1:] * forward[:, None] == until.direction)
             change = jnp.min(jnp.where(changes, intervals, _SAMPLES), axis=-1)
-            minima = minima_of(grid, values, slopes, sides) & (intervals[None] < change[:, None])
-            place, is_minimum = first_true(minima & busy[:, None], _MINIMA + 1)
-            reach = jnp.min(
+            minima = minima_of(grid, values, derivatives, sides) & (
+                intervals[None] < change[:, None]
+            )
+            place, is_minimum = first_true(minima & active[:, None], _MINIMA + 1)
+            valid_end = jnp.min(
                 jnp.where(is_minimum[:, _MINIMA], place[:, _MINIMA], _SAMPLES), initial=_SAMPLES
             )
             if until.samples is None:
-                moved = lanes._with_samples(grid, seen.states, lanes.status, lanes._steps, None)
-                angle = turning_rates(moved) * jnp.abs(span).reshape(-1, 1)
-                angle = jnp.where(busy[:, None] & jnp.isfinite(angle), angle, 0)
+                motion = lanes._with_samples(
+                    grid, evaluation.states, lanes.status, lanes._steps, None
+                )
+                angle = max_angular_rates(motion) * jnp.abs(span).reshape(-1, 1)
+                angle = jnp.where(active[:, None] & jnp.isfinite(angle), angle, 0)
                 angle = jnp.max(angle, axis=0, initial=0) * width / _SAMPLES
-                is_slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_TURN) | (
+                is_slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_REVOLUTION) | (
                     width <= min_width
                 )
                 first_fast = jnp.min(jnp.where(is_slow, _SAMPLES, jnp.arange(_SAMPLES + 1)))
-                reach = jnp.minimum(reach, jnp.maximum(first_fast, 1))
+                valid_end = jnp.minimum(valid_end, jnp.maximum(first_fast, 1))
             place, is_minimum = place[:, :_MINIMA], is_minimum[:, :_MINIMA]
-            return sides, change, place, is_minimum & (place < reach), reach
+            return sides, change, place, is_minimum & (place < valid_end), valid_end
 
-        def turns(seen: Looks, analysis) -> Brackets:
+        def turning_brackets(evaluation: Evaluation, analysis) -> Brackets:
             _, _, place, is_minimum, _ = analysis
-            slopes = seen.slopes[0]
+            derivatives = evaluation.derivatives[0]
             low, high, at_low, at_high = (
-                entries(x, place + k) for x in (grid, slopes) for k in (0, 1)
+                entries(x, place + k) for x in (grid, derivatives) for k in (0, 1)
             )
             return Brackets(low, high, at_low, at_high, is_minimum)
 
-        def brackets(seen: Looks, analysis, turning, turning_values):
+        def brackets(evaluation: Evaluation, analysis, turning, turning_values):
             """A bracket of the event in the first column; which bodies have one, and the index up
             to which the samples are valid."""
-            sides, change, place, is_minimum, reach = analysis
+            sides, change, place, is_minimum, valid_end = analysis
             minimum = _first_minimum(turning, turning_values, sides, place, is_minimum)
-            is_new = busy & (jnp.minimum(minimum.place, change) < reach)
+            is_new = active & (jnp.minimum(minimum.place, change) < valid_end)
             direction = until.direction * forward
-            ends = _bracket(grid, seen.values[0], change, minimum, direction, is_new)
+            ends = _bracket(grid, evaluation.values[0], change, minimum, direction, is_new)
             low, high, at_low, at_high = (jnp.repeat(x[:, None], _MINIMA, axis=1) for x in ends)
             use = is_new[:, None] & (jnp.arange(_MINIMA) == 0)[None]
-            return Brackets(low, high, at_low, at_high, use), (is_new, reach)
+            return Brackets(low, high, at_low, at_high, use), (is_new, valid_end)
 
         origin = begin if exact else sampled
-        look_width = min(max(_MINIMA, _policy.EVENT_LOOK // n), _SAMPLES + 1)
-        found = searched(
-            lambda t: looks(moved_to(origin, t)),
+        evaluation_width = min(max(_MINIMA, _policy.EVENT_SAMPLES // n), _SAMPLES + 1)
+        result = search_roots(
+            lambda t: evaluation_of(moved_to(origin, t)),
             grid,
             _MINIMA,
-            look_width,
+            evaluation_width,
             analyse,
-            turns,
+            turning_brackets,
             brackets,
-            None if exact else looks(sampled),
+            None if exact else evaluation_of(sampled),
         )
-        seen, (is_new, reach) = found.samples, found.beside
-        event_time = jnp.where(is_new, found.roots[:, 0], carry.event_time)
-        is_successful = carry.is_successful & seen.is_successful
-        samples, has_event = [x[:, reach] for x in seen.states], carry.has_event | is_new
-        next_width = jnp.where(reach < _SAMPLES, width, _GROWTH * width)
+        evaluation, (is_new, valid_end) = result.samples, result.auxiliary
+        event_time = jnp.where(is_new, result.roots[:, 0], carry.event_time)
+        is_successful = carry.is_successful & evaluation.is_successful
+        samples, has_event = [x[:, valid_end] for x in evaluation.states], carry.has_event | is_new
+        next_width = jnp.where(valid_end < _SAMPLES, width, _GROWTH * width)
         next_width = jnp.minimum(
-            next_width, width_by_rate(share[reach], samples, is_successful & ~has_event)
+            next_width, width_by_rate(share[valid_end], samples, is_successful & ~has_event)
         )
         return _Window(
-            carry.count + 1, share[reach], next_width, samples, has_event, is_successful, event_time
+            carry.count + 1,
+            share[valid_end],
+            next_width,
+            samples,
+            has_event,
+            is_successful,
+            event_time,
         )
 
-    def on(carry: _Window):
+    def continues(carry: _Window):
         unfinished = (carry.share < 1) & (carry.count < _MAX_WINDOWS)
         return unfinished & jnp.any(~carry.has_event & carry.is_successful)
 
@@ -500,9 +528,9 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
     carry = _Window(
         jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), is_successful, begin
     )
-    carry = jax.lax.while_loop(on, search_window, carry)
-    gave_up = ~carry.has_event & carry.is_successful & (carry.share < 1)
-    return carry.has_event, gave_up, carry.event_time, jnp.abs(carry.width * span) / _SAMPLES
+    carry = jax.lax.while_loop(continues, search_window, carry)
+    is_incomplete = ~carry.has_event & carry.is_successful & (carry.share < 1)
+    return carry.has_event, is_incomplete, carry.event_time, jnp.abs(carry.width * span) / _SAMPLES
 
 
 def _first_minimum(time, value, sides, place, is_minimum) -> _Minimum:
@@ -539,8 +567,8 @@ def _stopped_at(
     lanes: Trajectory, ts: Array, until: Event, has_event: Array, event_time: Array, step: Array
 ):
     """Samples, status, steps, times and event times, with the derivatives of the motion."""
-    back = ts[..., -1] < ts[..., 0]
-    sign = jnp.where(back, -1, 1).astype(ts.dtype)
+    is_backward = ts[..., -1] < ts[..., 0]
+    sign = jnp.where(is_backward, -1, 1).astype(ts.dtype)
     end = jnp.where(has_event, event_time, ts[..., -1])
     if ts.ndim == 1:  # as far as the last event of all bodies
         end = sign * jnp.max(sign * end)

@@ -125,9 +125,9 @@ class LiePoissonChart(AbstractChart):
         momentum = scene.momentum(state.omega_body, t)
         wxyz = state.wxyz
         if self.upright:
-            turn, _ = _upright(scene.potential)
-            turn = jnp.broadcast_to(rotation.conjugate(turn), wxyz.shape)
-            wxyz = rotation.multiply(turn, wxyz)
+            frame_rotation, _ = _upright(scene.potential)
+            frame_rotation = jnp.broadcast_to(rotation.conjugate(frame_rotation), wxyz.shape)
+            wxyz = rotation.multiply(frame_rotation, wxyz)
         y = components(momentum), jnp.unstack(wxyz, axis=-1), *_spins(scene, state)
         return y, jnp.ones(wxyz.shape[0], bool)
 
@@ -135,8 +135,8 @@ class LiePoissonChart(AbstractChart):
         momentum, wxyz, *spins = _as_numbers(y)
         omega = scene.with_spins(*(jnp.unstack(x, axis=-1) for x in spins)).rates(momentum, t)
         if self.upright:
-            turn, _ = _upright(scene.potential)
-            wxyz = _rotate(turn, wxyz)
+            frame_rotation, _ = _upright(scene.potential)
+            wxyz = _rotate(frame_rotation, wxyz)
         return rotation.normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
 
 
@@ -146,10 +146,10 @@ def _as_numbers(y: PyTree[Array]) -> list[Array]:
     return [numbers(jnp.stack(group, axis=-1), 1.0) for group in y]
 
 
-def _rotate(turn: Array, wxyz: Array) -> Array:
+def _rotate(frame_rotation: Array, wxyz: Array) -> Array:
     """Product of one quaternion (..., 1, 4) with many (..., T, 4), as a matrix product by columns:
     for many times this takes half as long as ``rotation.multiply``."""
-    a, b, c, d = jnp.unstack(turn, axis=-1)
+    a, b, c, d = jnp.unstack(frame_rotation, axis=-1)
     columns = ((a, b, c, d), (-b, a, d, -c), (-c, -d, a, b), (-d, c, -b, a))
     w, x, y, z = (
         jnp.stack(column, axis=-1) * wxyz[..., i, None] for i, column in enumerate(columns)
@@ -178,8 +178,8 @@ def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPo
         is_zero = jnp.all(field.gravity_space == 0, axis=-1)
         size = size + sum(underivable(g, is_zero) - g for g in gravity[:2])
         size = jnp.multiply(*jnp.broadcast_arrays(field.mass, size))
-    turn = jnp.stack([w, x, y, jnp.zeros_like(w)], axis=-1)
-    return turn, AlongZ(field, size)
+    frame_rotation = jnp.stack([w, x, y, jnp.zeros_like(w)], axis=-1)
+    return frame_rotation, AlongZ(field, size)
 
 
 class EulerChart(AbstractChart):
@@ -201,11 +201,11 @@ class EulerChart(AbstractChart):
 
     def start(self, scene, state, t):
         phi, theta, psi = q = wxyz_to_euler(state.wxyz)
-        sound = _away_from_poles(q)
-        q = (phi, jnp.where(sound, theta, jnp.pi / 2), psi)
+        is_regular = _away_from_poles(q)
+        q = (phi, jnp.where(is_regular, theta, jnp.pi / 2), psi)
         momentum = components(scene.momentum(state.omega_body, t))
         p = canonical_from_momentum(q, momentum)
-        return (q, tuple(jnp.where(sound, x, 0) for x in p), *_spins(scene, state)), sound
+        return (q, tuple(jnp.where(is_regular, x, 0) for x in p), *_spins(scene, state)), is_regular
 
     def finish(self, scene, y, t):
         q, p, *spins = (jnp.unstack(x, axis=-1) for x in _as_numbers(y))
@@ -227,13 +227,15 @@ def momentum_scale(scene: Scene, state: State, ts: Array) -> Array:
     t = ts[..., 0]
     momentum, spins = scene.momentum(state.omega_body, t), _spins(scene, state)
     y = (components(momentum), jnp.unstack(state.wxyz, axis=-1), *spins)
-    push, *_ = lie_poisson_field(t, y, scene.dynamics)
+    momentum_rates, *_ = lie_poisson_field(t, y, scene.dynamics)
     size = jnp.trace(_first_inertia(scene, ts).tensor, axis1=-2, axis2=-1)
     square = jnp.sum(momentum**2, axis=-1) + sum((x * x for group in spins for x in group), start=0)
-    square = square + size * jnp.sqrt(sum(x * x for x in push))
+    square = square + size * jnp.sqrt(sum(x * x for x in momentum_rates))
     square = square + slow_momentum(scene, ts) ** 2
-    resting = square == 0
-    return jax.lax.stop_gradient(jnp.where(resting, 1, jnp.sqrt(jnp.where(resting, 1, square))))
+    is_resting = square == 0
+    return jax.lax.stop_gradient(
+        jnp.where(is_resting, 1, jnp.sqrt(jnp.where(is_resting, 1, square)))
+    )
 
 
 def _first_inertia(scene: Scene, ts: Array) -> Inertia:

@@ -70,7 +70,7 @@ class Table(NamedTuple):
 
 def _row(order: int, length: int) -> list[np.ndarray]:
     sequence = SEQUENCES[order]
-    place = [len(sequence) - 1, *range(len(sequence) - 1)]
+    column_order = [len(sequence) - 1, *range(len(sequence) - 1)]
     sums = [
         [Fraction(0)] * drop + list(extrapolation_weights(sequence[drop:])) for drop in range(3)
     ]
@@ -79,7 +79,7 @@ def _row(order: int, length: int) -> list[np.ndarray]:
     result, lower_result, lowest_result = sums
     weights = np.zeros((3, length))
     counts = np.zeros(length, np.int32)
-    for k, j in enumerate(place):
+    for k, j in enumerate(column_order):
         counts[k] = sequence[j]
         if k:  # the others contribute small differences from the base, whose weight is one
             weights[:, k] = [
@@ -141,16 +141,16 @@ def extrapolated(
 ) -> Columns:
     """One step of the extrapolated midpoint rule.
 
-    ``rates(t, y, along)``: rates of the state and, if ``along``, of the ``integrals`` along the
-    solution, whose integrands are needed at every other point only. ``start_rates``: rates of
-    ``y``. ``t`` and ``width`` are scalars, or arrays with one entry for every body.
-    ``compensated``: changes of the state are summed instead of states.
+    ``rates(t, y, with_integrands)``: rates of the state and, if ``with_integrands``, of the
+    ``integrals`` along the solution, whose integrands are needed at every other point only.
+    ``start_rates``: rates of ``y``. ``t`` and ``width`` are scalars, or arrays with one entry for
+    every body. ``compensated``: changes of the state are summed instead of states.
     """
     # Rounding errors of changes are relative to the change in one step, not to the state. This
     # costs an addition in every substep, and is only used if `rtol` is close to rounding.
     origin = [jnp.zeros_like(x) for x in y] if compensated else y
 
-    def place(a):
+    def state_of(a):
         return [b + c for b, c in zip(y, a)] if compensated else a
 
     def column(n):
@@ -160,9 +160,9 @@ def extrapolated(
         def pair(i, carry):
             a, b, sums = carry
             time = t + (2 * i + 1).astype(h.dtype) * h
-            f, g = rates(time, place(b), True)
+            f, g = rates(time, state_of(b), True)
             a, sums = _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
-            f, _ = rates(time + h, place(a), False)
+            f, _ = rates(time + h, state_of(a), False)
             return a, _plus(b, step, f), sums
 
         # Leapfrog steps of a and b alternately, started by an Euler step. Gragg's smoothing at the
@@ -171,7 +171,7 @@ def extrapolated(
         b = _plus(origin, [x / 2 for x in step], start_rates)
         start = origin, b, [jnp.zeros_like(x) for x in integrals]
         a, b, sums = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
-        f, g = rates(t + (width - h), place(b), True)
+        f, g = rates(t + (width - h), state_of(b), True)
         return _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
 
     # The column with most substeps is the base, and the others contribute their differences from
@@ -182,14 +182,14 @@ def extrapolated(
             jax.lax.dynamic_index_in_dim(x, j, keepdims=False)
             for x in (columns.counts, *columns.weights)
         )
-        this = column(count.astype(jnp.result_type(width)))
-        base = jax.tree.map(lambda x, b: jnp.where(j == 0, x, b), this, base)
-        gap = jax.tree.map(jnp.subtract, this, base)
+        column_result = column(count.astype(jnp.result_type(width)))
+        base = jax.tree.map(lambda x, b: jnp.where(j == 0, x, b), column_result, base)
+        gap = jax.tree.map(jnp.subtract, column_result, base)
 
         def combine(x, s, d):
             return jnp.where(j == 0, x, s + shares[0].astype(d.dtype) * d)
 
-        result, sums = jax.tree.map(combine, this, (result, sums), gap)
+        result, sums = jax.tree.map(combine, column_result, (result, sums), gap)
         difference = [e + shares[1].astype(d.dtype) * d for e, d in zip(difference, gap[0])]
         lower_difference = [
             e + shares[2].astype(d.dtype) * d for e, d in zip(lower_difference, gap[0])

@@ -48,7 +48,7 @@ class Request(NamedTuple):
         times = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
         saveat = self._saveat(diffrax.SubSaveAt(t0=True, steps=1))
         saveat = eqx.tree_at(lambda s: s.solver_state, saveat, True)
-        return Stepping(solver, GivenTimes(times), saveat, times.shape[0] - 1, None)
+        return Stepping(solver, StepToTimes(times), saveat, times.shape[0] - 1, None)
 
     def by_error_estimate(self, solver, y0, term, dynamics) -> Stepping:
         """Steps of any solver with an error estimate, by diffrax's PID controller."""
@@ -98,7 +98,7 @@ class Solution(NamedTuple):
 
 
 def in_segments(
-    move: Callable[..., Solution],
+    solve: Callable[..., Solution],
     rates: Callable[..., PyTree[Array]],
     y: PyTree[Array],
     ts: Array,
@@ -107,7 +107,7 @@ def in_segments(
 ) -> Solution:
     """The solution in segments between the edges of ``torque``.
 
-    ``move(acting, y, times, parts)`` solves one segment from ``times[0]`` to ``times[-1]`` under
+    ``solve(acting, y, times, parts)`` solves one segment from ``times[0]`` to ``times[-1]`` under
     the torque ``acting`` there, with one of ``parts`` equal shares of the error; the first entry of
     ``times`` may occur several times. ``rates(acting, t, y)``: of the state. Derivatives by the
     edges are those by the ends of the segments.
@@ -123,7 +123,7 @@ def in_segments(
     # even if they are at the same time.
     numbers = jnp.arange(parts - 1, dtype=within.dtype)
     numbered = _with_edges(torque, sign * jnp.zeros_like(within).at[order].set(numbers))
-    moves = is_differentiated([ts, within])
+    has_edge_derivatives = is_differentiated([ts, within])
 
     def solve_segment(carry, segment):
         y, out, steps, status, error = carry
@@ -132,29 +132,31 @@ def in_segments(
         acting = numbered.during(sign * (number - 0.5))
         # An empty segment is solved over another length and the result discarded, so that no
         # derivative is NaN.
-        stop = jnp.where(is_empty, a + (end - start) / 16, b)
-        inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~is_empty
+        segment_end = jnp.where(is_empty, a + (end - start) / 16, b)
+        is_in_segment = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~is_empty
         if final_only:
-            times = jnp.stack([a, stop])
+            times = jnp.stack([a, segment_end])
         else:
-            times = sign * jnp.sort(sign * jnp.where(inside, ts, a))
-            times = jnp.concatenate([times, stop[None]])
-        solution = move(acting, y, times, parts)
+            times = sign * jnp.sort(sign * jnp.where(is_in_segment, ts, a))
+            times = jnp.concatenate([times, segment_end[None]])
+        solution = solve(acting, y, times, parts)
         successful = status == Status.SUCCESSFUL
         status = jnp.where(is_empty | ~successful, status, solution.status)
         steps = jax.tree.map(lambda a, b: a + jnp.where(is_empty, 0, b), steps, solution.steps)
         if error is not None:
             error = error + jnp.where(is_empty, 0, solution.error)
         if not final_only:
-            later = jnp.sum(jnp.where(sign * (ts - b) >= 0, 1, 0))
-            rows = jnp.minimum(jnp.arange(ts.shape[0]) + later, ts.shape[0])
+            passed_count = jnp.sum(jnp.where(sign * (ts - b) >= 0, 1, 0))
+            rows = jnp.minimum(jnp.arange(ts.shape[0]) + passed_count, ts.shape[0])
             out = jax.tree.map(
-                lambda old, new: jnp.where(inside[:, None], new[rows], old), out, solution.samples
+                lambda old, new: jnp.where(is_in_segment[:, None], new[rows], old),
+                out,
+                solution.samples,
             )
         # An empty segment changes nothing, but has derivatives by both of its ends.
         step = jnp.where(is_empty, b - a - jax.lax.stop_gradient(b - a), 0)
         y = jax.lax.cond(
-            moves,
+            has_edge_derivatives,
             lambda y: jax.tree.map(lambda x, f: x + step * f, y, rates(acting, a, y)),
             lambda y: y,
             y,
@@ -164,16 +166,24 @@ def in_segments(
         return (y, out, steps, status, error), None
 
     acting = numbered.during(-0.5)
-    shape = jax.eval_shape(lambda y: move(acting, y, jnp.stack([start, end]), parts), y)
+    shape = jax.eval_shape(lambda y: solve(acting, y, jnp.stack([start, end]), parts), y)
     lane = jax.tree.leaves(y)[0].shape
     out = None
     if not final_only:
         out = jax.tree.map(lambda x: jnp.zeros((ts.shape[0], *x.shape), x.dtype), y)
     initial_error = None if shape.error is None else jnp.zeros(lane, shape.error.dtype)
     zero_counts = jnp.zeros(lane, shape.steps.accepted.dtype)
-    begin = y, out, StepCounts.of(zero_counts), jnp.zeros(lane, shape.status.dtype), initial_error
+    initial_carry = (
+        y,
+        out,
+        StepCounts.of(zero_counts),
+        jnp.zeros(lane, shape.status.dtype),
+        initial_error,
+    )
     (y, out, steps, status, error), _ = jax.lax.scan(
-        solve_segment, begin, (bounds[:-1], bounds[1:], jnp.arange(parts, dtype=bounds.dtype))
+        solve_segment,
+        initial_carry,
+        (bounds[:-1], bounds[1:], jnp.arange(parts, dtype=bounds.dtype)),
     )
     end_state = jax.tree.map(lambda x: x[None], y)
     if final_only:
@@ -187,13 +197,13 @@ def _with_edges(torque: AbstractTorque, edges: Array) -> AbstractTorque:
     arrays, static = eqx.partition(torque, eqx.is_inexact_array)
     # Each edge is one entry of one array, so that the transpose of ``edges`` writes numbers to
     # these entries.
-    _, put = jax.vjp(lambda arrays: eqx.combine(arrays, static).edges, arrays)
-    (places,), (values,) = put(jnp.ones_like(edges)), put(edges)
-    arrays = jax.tree.map(lambda x, at, new: jnp.where(at != 0, new, x), arrays, places, values)
+    _, transpose_of_edges = jax.vjp(lambda arrays: eqx.combine(arrays, static).edges, arrays)
+    (positions,), (values,) = transpose_of_edges(jnp.ones_like(edges)), transpose_of_edges(edges)
+    arrays = jax.tree.map(lambda x, at, new: jnp.where(at != 0, new, x), arrays, positions, values)
     return eqx.combine(arrays, static)
 
 
-WAY_BACK = 8
+MIN_ADJOINT_INTERVALS = 8
 """Minimum number of intervals of the adjoint integration if torques act: it restarts from the saved
 state at the end of each."""
 
@@ -209,7 +219,7 @@ def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, A
     """
     arrays = [x for x in jax.tree.leaves((ts, inputs)) if eqx.is_inexact_array(x)]
     intervals = ts.shape[0] - 1
-    parts = -(-WAY_BACK // intervals)
+    parts = -(-MIN_ADJOINT_INTERVALS // intervals)
     inner = jnp.asarray(np.arange(1, parts) / parts, ts.dtype)
     between = ts[:-1, None] + (ts[1:] - ts[:-1])[:, None] * inner[None]
     spread = jnp.concatenate([between, ts[1:, None]], axis=1).reshape(-1)
@@ -222,7 +232,7 @@ def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, A
     return times, rows[-1:] if final_only else rows
 
 
-class GivenTimes(diffrax.StepTo):
+class StepToTimes(diffrax.StepTo):
     """``diffrax.StepTo`` without checks, for sorted times whose ends are those of the solution.
 
     The checks of ``diffrax.StepTo`` raise errors inside the program by callbacks of the host.
@@ -231,7 +241,7 @@ class GivenTimes(diffrax.StepTo):
     """
 
     def wrap(self, direction):
-        return GivenTimes(self.ts * direction)
+        return StepToTimes(self.ts * direction)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         del terms, t0, t1, y0, dt0, args, func, error_order
@@ -267,7 +277,7 @@ def one_step(terms, args, solver, saveat: diffrax.SaveAt, state: Any) -> Any:
         ts, ys = (jax.tree.map(lambda *x: jnp.stack(x), *column) for column in zip(*rows))
         count = len(rows)  # rows for further steps are not changed
         ts, ys = jax.tree.map(
-            lambda new, room: jnp.concatenate([new, room[count:]]),
+            lambda new, storage: jnp.concatenate([new, storage[count:]]),
             (ts, ys),
             (save_state.ts, save_state.ys),
         )

@@ -3,8 +3,11 @@
 ``python -m benchmarks.error_control`` compares estimated, requested and reached errors of random
 bodies with long-double solutions (docs/design_notes.md). With ``--constants`` it measures the steps
 and errors without each constant; other commands are named at the constant. eps: one unit in the
-last place, relative.
+last place, relative. ``drift_divisor`` is a formula that both rules share.
 """
+
+import jax.numpy as jnp
+from jaxtyping import Array
 
 # Both rules.
 
@@ -18,6 +21,13 @@ DRIFT_ANGLE = 100
 """[rad] Total angle beyond which the tolerance falls with the power 3/4 of the angle, because an
 error of the rates continues to rotate the body. The power would have to be 1 if the errors of all
 steps had the same sign, which is rare (1 body in 300)."""
+
+
+def drift_divisor(total_angle: Array) -> Array:
+    """Divisor of the tolerance: the power 3/4 of the angle over ``DRIFT_ANGLE``, at least 1."""
+    ratio = jnp.maximum(total_angle / DRIFT_ANGLE, 1)
+    return jnp.sqrt(ratio * jnp.sqrt(ratio))  # faster than a power
+
 
 ROUNDED_STEP = 8
 """[eps] Lower bound of the tolerance of a step: smaller errors are rounding, which a shorter step
@@ -124,11 +134,11 @@ COINCIDENT = 1e-6
 """[length of the motion] Switches with roots closer than this may be located at the same time: it
 is ``LOCATED_JUMP`` times the coarsest ``rtol``. Knots of a table are much farther apart."""
 
-MARGIN_TURN = 0.05
+MARGIN_VARIATION = 0.05
 """[factor] Of the largest margin of a switch within a step: smallest change between turning points
 that counts. A margin that falls to zero and returns changes by all of it."""
 
-DEEP_TURN = 0.5
+DEEP_EXTREMUM = 0.5
 """[factor] The same for a single turning point, if it is too large for one step: for a sine, 120
 degrees about an extremum. Without it, 2 of 63 short windows, each a seventh of the period long, in
 which an event function changes its sign, are missed (``tests/test_events.py``)."""
@@ -138,7 +148,7 @@ MARGIN_STEPS = 4.0
 turning points of margins, because a margin that is rounding alone would shorten them forever."""
 
 MAX_REVERSALS = 16
-"""[switches] Number of consecutive switches that turn back at once, after which the motion is taken
+"""[switches] Number of consecutive switches that flip back at once, after which the motion is taken
 to slide along a switch."""
 
 SHORT_REVERSALS = 2

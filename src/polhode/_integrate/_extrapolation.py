@@ -22,7 +22,7 @@ from polhode._integrate._columns import (
     extrapolated,
     table,
 )
-from polhode._integrate._diffrax_solve import GivenTimes
+from polhode._integrate._diffrax_solve import StepToTimes
 from polhode._integrate._field import BoundTerm, FixedArguments, GroupUnits
 from polhode._integrate._midpoint import (
     Field,
@@ -72,9 +72,9 @@ def collocate(terms, t0, t1, nodes, y1, args, order: int) -> dict:
 
     def on_substep(start, y0, y1):
         times = start + width * jnp.asarray(x, dtype)
-        slope = jax.vmap(lambda t, y: terms.vf_prod(t, y, args, control))
+        rates_at = jax.vmap(lambda t, y: terms.vf_prod(t, y, args, control))
         ends = jax.tree.map(lambda a, b: jnp.stack([a, b]), y0, y1)
-        slopes = slope(jnp.stack([start, start + width]), ends)
+        end_rates = rates_at(jnp.stack([start, start + width]), ends)
 
         def cubic(y0, y1, f):
             s, jump = column(x, y0), (y1 - y0)[None]
@@ -82,13 +82,13 @@ def collocate(terms, t0, t1, nodes, y1, args, order: int) -> dict:
             return y0[None] + s * f[:1] + s**2 * bend + s**3 * (f[:1] + f[1:] - 2 * jump)
 
         def sweep(_, ys):
-            def integrate(y0, y1, slope):
-                integral = contract(matrix, slope)
+            def integrate(y0, y1, node_rates):
+                integral = contract(matrix, node_rates)
                 return y0[None] + integral + column(x, y0) * ((y1 - y0)[None] - integral[-1:])
 
-            return jax.tree.map(integrate, y0, y1, slope(times, ys))
+            return jax.tree.map(integrate, y0, y1, rates_at(times, ys))
 
-        ys = jax.lax.fori_loop(0, order, sweep, jax.tree.map(cubic, y0, y1, slopes))
+        ys = jax.lax.fori_loop(0, order, sweep, jax.tree.map(cubic, y0, y1, end_rates))
         return jax.tree.map(lambda y: contract(series, y), ys)
 
     starts = t0 + width * jnp.arange(count, dtype=dtype)
@@ -109,9 +109,9 @@ class CollocationInterpolation(diffrax.AbstractLocalInterpolation):
         count = jax.tree.leaves(self.series)[0].shape[0]
         width = self.t1 - self.t0
         is_empty = width == 0
-        place = jnp.where(is_empty, 0, (t0 - self.t0) / jnp.where(is_empty, 1, width)) * count
-        index = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)
-        s = 2 * (place - index.astype(place.dtype)) - 1
+        position = jnp.where(is_empty, 0, (t0 - self.t0) / jnp.where(is_empty, 1, width)) * count
+        index = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, count - 1)
+        s = 2 * (position - index.astype(position.dtype)) - 1
 
         def clenshaw(series):
             coefficients = series[index]
@@ -246,7 +246,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         problem = BoundTerm.of(terms, args).prepare(t0, y0, dtype)
 
         def run(coefficients, t, width, y, compensation):
-            def rates(t, y, along):
+            def rates(t, y, with_integrands):
                 return problem.rates(coefficients, t, y), []
 
             columns = table(self._fixed_order, dtype)
@@ -278,7 +278,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         solver = dataclasses.replace(self, accuracy=accuracy)
         progress = state.solver_state._replace(rows=rows)
         state = eqx.tree_at(lambda s: (s.solver_state, s.tnext), state, (progress, times[-1]))
-        return solver, GivenTimes(times[np.array([0, -1])]), state
+        return solver, StepToTimes(times[np.array([0, -1])]), state
 
     def _take_many_steps(self, accuracy: Accuracy, terms, t0, t1, y0, args, progress: Progress):
         """As many steps of the method as ``accuracy`` requires."""
@@ -292,7 +292,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         units = units_of(args, y0, horizon)
 
         def run(coefficients, units, rtol, horizon, span, y, progress, elapsed):
-            def rates(coefficients, t, y, along):
+            def rates(coefficients, t, y, with_integrands):
                 return problem.rates(coefficients, t, y), []
 
             def table_for(rate):
@@ -352,16 +352,16 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))
     if isinstance(angle, float):
         return staged(jnp.asarray(best, rtol.dtype), opaque_ones(rtol))
-    order_found, least_work, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
+    chosen_order, least_work, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
     for order in CHOSEN:
         step = 0.9 * (0.27 * order - 0.3) * jnp.exp(size / (order + 1))
         work = (evaluations(order) + _policy.STEP_OVERHEAD) * jnp.maximum(1, angle / step)
         better = (order <= best) & (work < least_work) & (angle < step)
-        order_found, least_work = (
-            jnp.where(better, order, order_found),
+        chosen_order, least_work = (
+            jnp.where(better, order, chosen_order),
             jnp.where(better, work, least_work),
         )
-    return staged(jnp.asarray(order_found, rtol.dtype), opaque_ones(rtol))
+    return staged(jnp.asarray(chosen_order, rtol.dtype), opaque_ones(rtol))
 
 
 class Automatic(Extrapolation):

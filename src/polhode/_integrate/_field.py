@@ -75,10 +75,10 @@ class FixedArguments(eqx.Module):
     units: Any
 
 
-def uses(jaxpr, place: int) -> bool:
-    """Whether the results of a program depend on its operand at ``place``."""
+def uses(jaxpr, index: int) -> bool:
+    """Whether the results of a program depend on its operand at ``index``."""
     _, is_used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    return is_used[place]
+    return is_used[index]
 
 
 class Prepared(NamedTuple):
@@ -121,11 +121,11 @@ class GroupUnits(eqx.Module):
     def __call__(self, y: list[Array], rates: list[Array]) -> tuple[list[Array], Array]:
         weights, square, start = [], jnp.zeros_like(y[0]), 0
         for count in self.groups:
-            these = slice(start, start + count)
-            size = sum(x * x for x in y[these])
-            size = size + 1e-6 * sum((self.span.astype(x.dtype) * x) ** 2 for x in rates[these])
+            group = slice(start, start + count)
+            size = sum(x * x for x in y[group])
+            size = size + 1e-6 * sum((self.span.astype(x.dtype) * x) ** 2 for x in rates[group])
             weight = 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
-            square = square + sum((weight * x) ** 2 for x in rates[these])
+            square = square + sum((weight * x) ** 2 for x in rates[group])
             weights += [weight] * count
             start += count
         return weights, jnp.sqrt(square)

@@ -19,7 +19,7 @@ from polhode._integrate._extrapolation import Extrapolation
 from polhode._integrate._field import FixedArguments
 from polhode._integrate._flow_derivative import Equations, equations_of
 from polhode._integrate._midpoint import Progress
-from polhode._kernels import along_slopes, attached, kernel
+from polhode._kernels import jvp_of_nonzero, kernel, with_derivative_rule
 
 
 class FlowAdjoint(diffrax.AbstractAdjoint):
@@ -127,7 +127,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
             times.shape[0], saved_states[0].shape[0]
         )  # rows for further steps are not changed
         states = [x[:count] for x in saved_states]
-        path = path_of(equations, c, leaves, t0, times[:count], states)
+        path = path_with_derivatives(equations, c, leaves, t0, times[:count], states)
         path = [jnp.concatenate([x, s[count:]]) for x, s in zip(path, saved_states)]
         ys = jax.tree.unflatten(tree, path)
         state = eqx.tree_at(lambda s: _first_sub(s.save_state).ys, state, ys)
@@ -162,34 +162,34 @@ def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
     if sub.steps:
         if not isinstance(controller, diffrax.StepTo):
             return None
-        later = controller.ts[1:]
-        return jnp.concatenate([jnp.stack([t0]), later]) if sub.t0 else later
+        step_ends = controller.ts[1:]
+        return jnp.concatenate([jnp.stack([t0]), step_ends]) if sub.t0 else step_ends
     times = [jnp.stack([t0])] if sub.t0 else []
     times += [] if sub.ts is None else [sub.ts]
     times += [jnp.stack([t1])] if sub.t1 else []
     return jnp.concatenate(times)
 
 
-def path_of(equations: Equations, c, y0, t0, times, states):
+def path_with_derivatives(equations: Equations, c, y0, t0, times, states):
     """The saved states (components (T, N)) with the derivatives of the flow."""
     size = len(y0)
 
     def rule(operands, tangents, states):
-        def follow(inputs):
+        def saved_path(inputs):
             t0, times, start, c = inputs[0], inputs[1], inputs[2 : 2 + size], inputs[2 + size :]
             # times that were not reached are inf; the interval to them is replaced by an empty one
             times = jnp.where(jnp.isfinite(times), times, jax.lax.stop_gradient(t0))
             horizon = jax.lax.stop_gradient(jnp.max(jnp.abs(times - t0)))
             starts = jnp.concatenate([jnp.stack([t0]), times[:-1]])
 
-            def across(y, interval):
+            def one_interval(y, interval):
                 start, end, end_state = interval
-                y = equations.follow(c, y, start, end, horizon, end_state)
+                y = equations.attach_derivatives(c, y, start, end, horizon, end_state)
                 return y, y
 
-            _, later = jax.lax.scan(across, start, (starts, times, list(states)))
-            return later
+            _, end_states = jax.lax.scan(one_interval, start, (starts, times, list(states)))
+            return end_states
 
-        return along_slopes(follow, operands, tangents)
+        return jvp_of_nonzero(saved_path, operands, tangents)
 
-    return attached(rule, [t0, times, *y0, *c], states)
+    return with_derivative_rule(rule, [t0, times, *y0, *c], states)

@@ -38,11 +38,11 @@ class Field(NamedTuple):
     """Equations of motion of bodies that are entries of arrays; ``data``: the ``coefficients`` of
     the rates and the ``unit_data`` of the units.
 
-    ``rates(coefficients, t, y, along)``: see ``extrapolated``. ``units(unit_data, y, rates)``:
-    weights of the components of an error, whose squares are summed, and the natural rate [rad/s].
-    ``individual_steps``: whether each body takes steps of its own; the rates must then not depend
-    on the time. ``by_entry``: whether a body can be replaced by another one by replacing its entry
-    in all of these arrays."""
+    ``rates(coefficients, t, y, with_integrands)``: see ``extrapolated``. ``units(unit_data, y,
+    rates)``: weights of the components of an error, whose squares are summed, and the natural rate
+    [rad/s]. ``individual_steps``: whether each body takes steps of its own; the rates must then not
+    depend on the time. ``by_entry``: whether a body can be replaced by another one by replacing its
+    entry in all of these arrays."""
 
     rates: Callable[..., tuple[list[Array], list[Array]]]
     units: Callable[..., tuple[list[Array], Array]]
@@ -93,7 +93,7 @@ def initial_progress(y: list[Array], compensated: bool, t: Array) -> Progress:
     return Progress(zero, zero, compensation, zero, zero, zero, zero, jnp.zeros_like(t), reason)
 
 
-class _Saved(NamedTuple):
+class _SaveCursor(NamedTuple):
     """Saved states: ``place`` (n,): index of the next one of each body, ``next_time`` (n,)
     [s] after the start."""
 
@@ -101,7 +101,9 @@ class _Saved(NamedTuple):
     next_time: Array
 
     @classmethod
-    def at_start(cls, rows: Array, save_times: Array, y: list[Array]) -> tuple["_Saved", Array]:
+    def at_start(
+        cls, rows: Array, save_times: Array, y: list[Array]
+    ) -> tuple["_SaveCursor", Array]:
         """Before the first step: the initial state at saved times that are the start, and NaN at
         all others. ``rows`` are overwritten, since this is faster than to read them."""
         is_start = save_times <= 0
@@ -114,21 +116,21 @@ class _Saved(NamedTuple):
 
     def update(
         self, is_due: Array, body: Array, save_times: Array, y: list[Array], rows: Array
-    ) -> tuple["_Saved", Array]:
+    ) -> tuple["_SaveCursor", Array]:
         """Store the states of the bodies that have reached their next saved time (``is_due``) in
         ``rows`` (n (T + 1), C); the others write to their dummy row."""
         unused = save_times.shape[0]
 
-        def once(carry):
+        def store_states(carry):
             save_cursor, rows, _ = carry
-            at = body * (unused + 1) + jnp.where(is_due, save_cursor.place, unused)
-            rows = put(rows, at, jnp.stack(y, axis=-1))
+            row_indices = body * (unused + 1) + jnp.where(is_due, save_cursor.place, unused)
+            rows = put(rows, row_indices, jnp.stack(y, axis=-1))
             place = save_cursor.place + jnp.where(is_due, 1, 0)
-            return _Saved(place, save_times.at[place].get(mode="clip")), rows, False
+            return _SaveCursor(place, save_times.at[place].get(mode="clip")), rows, False
 
         any_due = any_of(is_due.astype(self.next_time.dtype))
         # a loop of one iteration or none, because a branch (``cond``) would copy all saved states
-        return jax.lax.while_loop(lambda carry: carry[2], once, (self, rows, any_due))[:2]
+        return jax.lax.while_loop(lambda carry: carry[2], store_states, (self, rows, any_due))[:2]
 
 
 class _Carry(NamedTuple):
@@ -147,10 +149,10 @@ class _Carry(NamedTuple):
     error: Array
     steps: Array
     at_times: Array
-    save_cursor: _Saved | None
+    save_cursor: _SaveCursor | None
 
 
-class _Fixed(NamedTuple):
+class _LoopConstants(NamedTuple):
     """Constants of the loop: ``data`` of the field; the index of each body; the reason why it
     failed before, or 0. They are not part of the carry, in which constants may crash XLA."""
 
@@ -197,15 +199,17 @@ def integrate(
             else jnp.broadcast_to(jnp.max(jnp.where(has_failed, 0, x)), x.shape)
         )
 
-    def failed(constants, carry):
+    def failed_bodies(constants, carry):
         """Bodies that have used all their steps, or whose steps have become too short."""
-        able = (carry.steps < limits.steps) & (carry.width > control.MIN_WIDTH * eps * length)
-        return ~(able & (constants.reason == 0))
+        can_continue = (carry.steps < limits.steps) & (
+            carry.width > control.MIN_WIDTH * eps * length
+        )
+        return ~(can_continue & (constants.reason == 0))
 
-    def live(constants, carry):
-        return (carry.elapsed < duration) & ~failed(constants, carry)
+    def active(constants, carry):
+        return (carry.elapsed < duration) & ~failed_bodies(constants, carry)
 
-    def bound(constants):
+    def bound_functions(constants):
         """Rates and units of bodies."""
         coefficients, unit_data = constants.data
         return partial(field.rates, coefficients), partial(field.units, unit_data)
@@ -233,11 +237,13 @@ def integrate(
             fall = (
                 width / jnp.where(carry.rejected_step[1] > 0, carry.rejected_step[1], 1)
             ) ** columns.order
-            rough = (carry.rejected_step[1] > 0) & (
+            is_rough = (carry.rejected_step[1] > 0) & (
                 error > control.ROUGH_FALL * fall * carry.rejected_step[0]
             )
             error = jnp.where(
-                rough & (error > control.ROUGH_ROUNDING * eps), control.ROUGH_ERROR * error, error
+                is_rough & (error > control.ROUGH_ROUNDING * eps),
+                control.ROUGH_ERROR * error,
+                error,
             )
         angle = rate * width
         expected = (
@@ -249,17 +255,17 @@ def integrate(
         fraction = jnp.minimum(carry.total_angle / expected, 1)
         first_share = control.FIRST_SHARE
         share = control.MIDPOINT_SHARE * (first_share + 3 * (1 - first_share) * fraction * fraction)
-        tolerance = share * limits.rtol * angle / (expected * _drift(expected))
+        tolerance = share * limits.rtol * angle / (expected * control.drift_divisor(expected))
         rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
         tolerance = jnp.maximum(tolerance, rounding * eps)
-        sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a long attempt may overflow
-        error, tolerance = jnp.where(sound, error, jnp.inf), jnp.where(sound, tolerance, 1)
-        return jax.lax.stop_gradient((error, tolerance, jnp.where(sound, angle, 0)))
+        is_finite = jnp.isfinite(error) & jnp.isfinite(angle)  # a long attempt may overflow
+        error, tolerance = jnp.where(is_finite, error, jnp.inf), jnp.where(is_finite, tolerance, 1)
+        return jax.lax.stop_gradient((error, tolerance, jnp.where(is_finite, angle, 0)))
 
     def step_bodies(constants, carry, rows):
         """One step of each body."""
-        rates, units = bound(constants)
-        is_running = live(constants, carry)
+        rates, units = bound_functions(constants)
+        is_running = active(constants, carry)
         target_time = duration if carry.save_cursor is None else carry.save_cursor.next_time
         time_left = (target_time - carry.elapsed).astype(dtype)
         # the remainder is divided in two so that the last step is not much shorter than the others
@@ -271,12 +277,15 @@ def integrate(
         # accumulate. After a rejected step it is rounded down: rounded up, it could be the same
         # step again.
         end_time = carry.elapsed + width.astype(carry.elapsed.dtype)
-        grain = jnp.finfo(end_time.dtype).eps * end_time  # one or two units in its last place
-        exact = (end_time - carry.elapsed).astype(dtype)
-        down = (exact > width) & (carry.rejected_step[1] > 0)
-        exact = jnp.where(down, (end_time - grain - carry.elapsed).astype(dtype), exact)
-        exact = jnp.minimum(jnp.maximum(exact, grain.astype(dtype)), time_left)
-        width = jnp.where(width == time_left, time_left, exact)
+        # one or two units in the last place of the time
+        resolution = jnp.finfo(end_time.dtype).eps * end_time
+        exact_width = (end_time - carry.elapsed).astype(dtype)
+        rounds_down = (exact_width > width) & (carry.rejected_step[1] > 0)
+        exact_width = jnp.where(
+            rounds_down, (end_time - resolution - carry.elapsed).astype(dtype), exact_width
+        )
+        exact_width = jnp.minimum(jnp.maximum(exact_width, resolution.astype(dtype)), time_left)
+        width = jnp.where(width == time_left, time_left, exact_width)
         width = jnp.where(is_running, width, 0)
         elapsed, h = (x if individual_steps else jnp.max(x) for x in (carry.elapsed, width))
         t, h = start + sign * elapsed, sign.astype(dtype) * h
@@ -291,7 +300,7 @@ def integrate(
         error, tolerance, angle = error_and_tolerance(
             rates, units, carry, t, h, width, end_state, result, end_rates
         )
-        ratio = worst(error / tolerance, failed(constants, carry))
+        ratio = worst(error / tolerance, failed_bodies(constants, carry))
         accepted = (ratio <= 1) & is_running
         # by logarithms: a power takes as long as three of them
         size = jnp.log(jnp.maximum(ratio, control.MIN_RATIO))
@@ -304,13 +313,13 @@ def integrate(
             is_rounding = jnp.maximum(
                 angle / control.SHORT_STEP, error / (control.ROUNDED_STEP * eps)
             )
-            is_short = worst(is_rounding, failed(constants, carry)) < 1
+            is_short = worst(is_rounding, failed_bodies(constants, carry)) < 1
             is_short = is_short & (carry.rejected_step[1] == 0)
             factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_FACTOR, factor)
         proposed = jnp.where(
             accepted & is_cut, jnp.maximum(carry.width, width * factor), width * factor
         )
-        proposed = jnp.where(accepted | (width > grain.astype(dtype)), proposed, 0)
+        proposed = jnp.where(accepted | (width > resolution.astype(dtype)), proposed, 0)
         proposed = jnp.where(is_running, proposed, carry.width)
         later_time = jnp.where(
             width == time_left, target_time, carry.elapsed + width.astype(carry.elapsed.dtype)
@@ -323,16 +332,16 @@ def integrate(
                 is_due, constants.body, save_times, end_state, rows
             )
 
-        def pick(a, b):
+        def select(a, b):
             return [jnp.where(accepted, x, y) for x, y in zip(a, b)]
 
         rejected_step = (accepted, 0, error), (accepted, 0, width)
         carry = _Carry(
             carry.attempts + jnp.where(is_running, 1, 0).astype(dtype),
             elapsed,
-            pick(end_state, carry.y),
-            pick(end_rates, carry.rates),
-            pick(compensation, carry.compensation),
+            select(end_state, carry.y),
+            select(end_rates, carry.rates),
+            select(compensation, carry.compensation),
             _select_integrals(accepted, result.sums, carry.integrals),
             proposed,
             jnp.where(accepted, size, carry.last_error),
@@ -346,20 +355,20 @@ def integrate(
         return carry, rows
 
     body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
-    constants = _Fixed(field.data, body, progress.reason)
+    constants = _LoopConstants(field.data, body, progress.reason)
     # half of what a smooth motion permits, or the whole duration if that is shorter
     guess = control.FIRST_WIDTH * limits.rtol.astype(dtype) ** power
     guess = guess / jnp.maximum(rate, 1 / (length + remaining))
     guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are NaN
     guess = jax.lax.stop_gradient(guess)
     if not individual_steps:
-        sound = jnp.where(
+        valid_guess = jnp.where(
             guess > 0, guess, jnp.inf
         )  # a body that is not finite does not delay others
-        guess = jnp.where(guess > 0, jnp.min(sound), guess)
+        guess = jnp.where(guess > 0, jnp.min(valid_guess), guess)
     save_cursor, rows = None, None
     if save_times is not None:
-        save_cursor, rows = _Saved.at_start(progress.rows, save_times, y)
+        save_cursor, rows = _SaveCursor.at_start(progress.rows, save_times, y)
     carry = _Carry(
         zero,
         jnp.zeros(zero.shape, start.dtype),
@@ -378,7 +387,7 @@ def integrate(
     )
 
     def can_step(constants, carry):
-        return live(constants, carry) & (carry.attempts < control.ATTEMPTS * limits.steps)
+        return active(constants, carry) & (carry.attempts < control.ATTEMPTS * limits.steps)
 
     def finish(constants, carry):
         has_finished = (carry.elapsed >= duration) & (constants.reason == 0)
@@ -387,8 +396,10 @@ def integrate(
         steps_remain = (carry.steps < limits.steps) & (
             carry.attempts < control.ATTEMPTS * limits.steps
         )
-        why = jnp.where(steps_remain, jnp.where(numbers, 2, 3), 1)
-        reason = jnp.where(has_finished, 0, jnp.where(constants.reason > 0, constants.reason, why))
+        cause = jnp.where(steps_remain, jnp.where(numbers, 2, 3), 1)
+        reason = jnp.where(
+            has_finished, 0, jnp.where(constants.reason > 0, constants.reason, cause)
+        )
         # a float, so that it can be stacked with the other numbers
         reason = reason.astype(dtype)
         steps = carry.steps, carry.attempts, carry.at_times
@@ -423,13 +434,6 @@ def integrate(
     )
 
 
-def _drift(angle: Array) -> Array:
-    """Divisor of the tolerance: the power 3/4 of the angle over ``DRIFT_ANGLE``, by square roots,
-    which are faster than a power."""
-    ratio = jnp.maximum(angle / control.DRIFT_ANGLE, 1)
-    return jnp.sqrt(ratio * jnp.sqrt(ratio))
-
-
 def _select_integrals(accepted, candidates, integrals):
     """Integrals after accepted steps. An integral over all bodies, of another shape, is accepted
     with the step that the bodies have in common."""
@@ -452,18 +456,21 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
     gap = control.JUMP_GAP * width
     eps = float(jnp.finfo(width.dtype).eps)
 
-    def pick(at_end, a, b):
+    def select(at_end, a, b):
         return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
 
     def add_end(end, total):
         """Add the error at one end: 0, the start, or 1. Loops over ends and samples, so that the
         program contains the rates once."""
         at_end = end == 1
-        base, base_rates = pick(at_end, carry.y, end_state), pick(at_end, carry.rates, end_rates)
+        base, base_rates = (
+            select(at_end, carry.y, end_state),
+            select(at_end, carry.rates, end_rates),
+        )
         # forward along the tangent at the start, backward along the chord at the end
         chord = [a - b for a, b in zip(carry.y, end_state)]
-        part = [gap * f for f in carry.rates]
-        part = pick(at_end, part, [control.JUMP_GAP * x for x in chord])
+        sample_step = [gap * f for f in carry.rates]
+        sample_step = select(at_end, sample_step, [control.JUMP_GAP * x for x in chord])
         start, sign = jnp.where(at_end, t + width, t), jnp.where(at_end, -1, 1)
 
         def further(k, result):
@@ -472,7 +479,7 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
             older_rows, sizes = result
             k = k.astype(width.dtype)
             time = (start + sign * k * gap).reshape(-1)[0]
-            row = rates(time, [a + k * b for a, b in zip(base, part)], False)[0]
+            row = rates(time, [a + k * b for a, b in zip(base, sample_step)], False)[0]
             rows = [row]
             for older in older_rows:
                 row = [a - b for a, b in zip(row, older)]
@@ -514,17 +521,17 @@ def in_lanes(
     """
     n = constants.body.size
     # no more lanes than needed for the same number of bodies in each lane, a multiple of 8
-    wide = -(-n // -(-n // _policy.LANES))
-    wide += -wide % 8
+    lane_count = -(-n // -(-n // _policy.LANES))
+    lane_count += -lane_count % 8
     parts, tree = jax.tree.flatten(constants)
-    constant = [x for x in parts if x.shape == (n,)]
-    changing, form = jax.tree.flatten(carry)
-    endings, shape = jax.tree.flatten(finish(constants, carry))
-    queue = _stacked(constant), _stacked(changing)
+    constant_arrays = [x for x in parts if x.shape == (n,)]
+    carry_arrays, carry_tree = jax.tree.flatten(carry)
+    endings, result_tree = jax.tree.flatten(finish(constants, carry))
+    queue = _stacked(constant_arrays), _stacked(carry_arrays)
 
     def constants_of(fixed_rows):
         """The constants of the bodies in the lanes."""
-        lane_rows = iter(_as(constant, fixed_rows))
+        lane_rows = iter(_with_dtypes(constant_arrays, fixed_rows))
         return jax.tree.unflatten(tree, [next(lane_rows) if x.shape == (n,) else x for x in parts])
 
     def refill(loop):
@@ -534,24 +541,26 @@ def in_lanes(
         is_finished = ~can_step(constants, carry)
         endings = _stacked(jax.tree.leaves(finish(constants, carry)))
         results = put(results, constants.body, endings.T)
-        lane = jnp.arange(wide)
+        lane = jnp.arange(lane_count)
         rank = jnp.sum(jnp.where((lane[:, None] > lane[None]) & is_finished[None], 1, 0), axis=1)
         index = next_body + rank
         is_refilled = is_finished & (index < n)
-        others, start = (x.at[:, index].get(mode="clip") for x in queue)
-        start = jax.tree.unflatten(form, _as(changing, start))
+        next_constants, start = (x.at[:, index].get(mode="clip") for x in queue)
+        start = jax.tree.unflatten(carry_tree, _with_dtypes(carry_arrays, start))
         carry = jax.tree.map(lambda a, b: jnp.where(is_refilled, a, b), start, carry)
         count = jnp.sum(jnp.where(is_finished, 1, 0))
         # n: the queue is empty; n + 1: all results are stored, and do not change while other queues
         # of a batch continue (under ``vmap``)
-        is_last = (count == wide) & (next_body >= n)
+        is_last = (count == lane_count) & (next_body >= n)
         next_body = jnp.where(is_last, n + 1, jnp.minimum(next_body + count, n))
-        return jnp.where(is_refilled, others, fixed_rows), carry, results, next_body, False
+        return jnp.where(is_refilled, next_constants, fixed_rows), carry, results, next_body, False
 
-    def turn(loop):
+    def iterate(loop):
         fixed_rows, carry, results, next_body, rows = loop
-        idle = jnp.sum(jnp.where(can_step(constants_of(fixed_rows), carry), 0, 1))
-        needs_refill = (idle >= _policy.REFILL_LANES) & (next_body < n) | (idle == wide)
+        idle_count = jnp.sum(jnp.where(can_step(constants_of(fixed_rows), carry), 0, 1))
+        needs_refill = (idle_count >= _policy.REFILL_LANES) & (next_body < n) | (
+            idle_count == lane_count
+        )
         # a loop of one iteration or none, because a branch (``cond``) would copy all its results
         start = fixed_rows, carry, results, next_body, any_of(jnp.where(needs_refill, 1.0, 0.0))
         fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], refill, start)
@@ -559,14 +568,14 @@ def in_lanes(
         return fixed_rows, carry, results, next_body, rows
 
     # At the start every lane has a finished body of zeros; its results are overwritten later.
-    fixed_rows, start = (jnp.zeros((len(x), wide), x.dtype) for x in queue)
-    carry = jax.tree.unflatten(form, _as(changing, start))
+    fixed_rows, start = (jnp.zeros((len(x), lane_count), x.dtype) for x in queue)
+    carry = jax.tree.unflatten(carry_tree, _with_dtypes(carry_arrays, start))
     results = jnp.zeros_like(_stacked(endings).T)
     start = fixed_rows, carry, results, jnp.zeros((), int), rows
     *_, results, _, rows = jax.lax.while_loop(
-        lambda loop: any_of(jnp.where(loop[3] <= n, 1.0, 0.0)), turn, start
+        lambda loop: any_of(jnp.where(loop[3] <= n, 1.0, 0.0)), iterate, start
     )
-    return jax.tree.unflatten(shape, _as(endings, results.T)), rows
+    return jax.tree.unflatten(result_tree, _with_dtypes(endings, results.T)), rows
 
 
 def _stacked(arrays: list[Array]) -> Array:
@@ -577,6 +586,6 @@ def _stacked(arrays: list[Array]) -> Array:
     return jnp.stack([x.astype(widest) for x in arrays])
 
 
-def _as(like: list[Array], rows: Array) -> list[Array]:
+def _with_dtypes(like: list[Array], rows: Array) -> list[Array]:
     """The rows of a matrix with the dtypes of the arrays that were stacked."""
     return [row.astype(x.dtype) for x, row in zip(like, rows)]

@@ -8,15 +8,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
 from polhode._integrate._explicit_step import Motion
-from polhode._integrate._switches import STATE, TIME, Switched, switched
+from polhode._integrate._switches import STATE, TIME, SwitchedProgram, switches_of
 from polhode._integrate._tableau import Tableau
-from polhode._kernels import Distinct, formula, is_holdable, specialise
+from polhode._kernels import (
+    Distinct,
+    constants_as_operands,
+    dependent_results,
+    formula,
+    is_fusible,
+    specialise,
+)
 
-Pose = Callable[[Any], tuple[Any, Any]]
+TermOf = Callable[[Any], tuple[Any, Any]]
 """From the parts of a scene, with the arrays of one body (lane axis of length 1), to the diffrax
 term of its equations and the term's arguments."""
 
@@ -35,7 +42,7 @@ class Problem(NamedTuple):
     closed_jaxpr: ClosedJaxpr
     arrays: list[Any]
     lanes: tuple[bool, ...]
-    switches: Switched
+    switches: SwitchedProgram
     events: int
     components: int
     dtype: Any
@@ -45,35 +52,38 @@ class Problem(NamedTuple):
     @classmethod
     def of(
         cls,
-        pose: Pose,
+        term_of: TermOf,
         parts: Any,
         is_lane: Any,
         y0: Any,
         t: Array,
-        watch: Any = None,
+        evaluate_events: Any = None,
         located: bool = True,
     ):
         """``parts``: arrays of all bodies; ``is_lane``: a tree of truth values, whether each has a
-        lane axis; ``y0``: a state with components (B,); ``watch(parts, t, y)``: values (E,) of the
-        event functions of one body; ``located``: whether steps end at switches; if not, they are
-        only counted."""
+        lane axis; ``y0``: a state with components (B,); ``evaluate_events(parts, t, y)``: values
+        (E,) of the event functions of one body; ``located``: whether steps end at switches; if not,
+        they are only counted."""
         # An array that occurs in several parts of the scene (an orbit in potential and torque) is
         # one operand; otherwise values that depend on it would be computed several times.
-        parts_and_lanes = jax.tree.map(_Marked, parts, is_lane)
-        leaves, tree = jax.tree.flatten(parts_and_lanes, is_leaf=lambda x: isinstance(x, _Marked))
+        parts_and_lanes = jax.tree.map(_LeafAndLane, parts, is_lane)
+        leaves, tree = jax.tree.flatten(
+            parts_and_lanes, is_leaf=lambda x: isinstance(x, _LeafAndLane)
+        )
         arrays = [x.value for x in leaves if eqx.is_array(x.value)]
         lanes = [bool(x.lane) for x in leaves if eqx.is_array(x.value)]
         distinct = Distinct(arrays)
-        once = distinct.leaves
-        first = {place: k for k, place in reversed(list(enumerate(distinct.places)))}
-        flags = [lanes[first[i]] for i in range(len(once))]
+        distinct_arrays = distinct.leaves
+        first_places = {place: k for k, place in reversed(list(enumerate(distinct.places)))}
+        flags = [lanes[first_places[i]] for i in range(len(distinct_arrays))]
         components, state_tree = jax.tree.flatten(y0)
         events = 0
 
-        def equations(t, *operands):
+        def equations(*operands):
             nonlocal events
-            y = jax.tree.unflatten(state_tree, operands[: len(components)])
-            ordered_arrays = iter([operands[len(components) :][i] for i in distinct.places])
+            t, *y = operands[len(distinct_arrays) :]
+            y = jax.tree.unflatten(state_tree, y)
+            ordered_arrays = iter([operands[i] for i in distinct.places])
             values = [
                 (next(ordered_arrays)[None] if x.lane else next(ordered_arrays))
                 if eqx.is_array(x.value)
@@ -81,32 +91,32 @@ class Problem(NamedTuple):
                 for x in leaves
             ]
             parts = jax.tree.unflatten(tree, values)
-            term, args = pose(parts)
+            term, args = term_of(parts)
             rates = jax.tree.leaves(term.vf(t, y, args))
-            if watch is None:
+            if evaluate_events is None:
                 return rates
-            event_values = watch(parts, t, y)
+            event_values = evaluate_events(parts, t, y)
             events = event_values.size
             # A comparison, so that events are located as switches are. The term 0 * t makes it
             # vary with the time, even if the event function does not.
             return [*rates, jnp.where(event_values + 0 * t >= 0, 1, 0)]
 
-        single_lane = [x[0] if lane else x for x, lane in zip(once, flags)]
+        single_lane = [x[0] if lane else x for x, lane in zip(distinct_arrays, flags)]
         dtype = jnp.result_type(*components)
-        closed_jaxpr = formula(equations, t, *(jnp.ravel(x)[:1] for x in components), *single_lane)
-        closed_jaxpr, consts = _with_consts_as_operands(closed_jaxpr, 1 + len(components))
+        closed_jaxpr = formula(equations, *single_lane, t, *(jnp.ravel(x)[:1] for x in components))
+        closed_jaxpr, consts = constants_as_operands(closed_jaxpr)
         varies = [
             *[0] * (len(closed_jaxpr.jaxpr.invars) - 1 - len(components)),
             TIME,
             *[STATE] * len(components),
         ]
-        switches = switched(closed_jaxpr, varies, dtype)
+        switches = switches_of(closed_jaxpr, varies, dtype)
         passed_switches = 0 if located else switches.count
         if not located:
-            switches = switched(closed_jaxpr, [0] * len(varies), dtype)
+            switches = switches_of(closed_jaxpr, [0] * len(varies), dtype)
         return cls(
             closed_jaxpr,
-            [*consts, *once],
+            [*consts, *distinct_arrays],
             (*[False] * len(consts), *flags),
             switches,
             events,
@@ -143,14 +153,14 @@ class Problem(NamedTuple):
         stacks = _Stacks([(*kind, i) for i, kind in enumerate(kinds)] if differentiable else kinds)
 
         def coefficients_of(*parameters):
-            return stacks.of(prepare(*parameters))
+            return stacks.stack(prepare(*parameters))
 
         # Values that are the same for all bodies are computed once and get no batch axis: the
         # weights of a network would otherwise be copied for every body.
         axes = [0 if lane else None for lane in self.lanes]
-        out = [0 if moves else None for moves, *_ in stacks.kinds]
+        lane_axes = [0 if is_lane else None for is_lane, *_ in stacks.kinds]
         coefficients = (
-            jax.vmap(coefficients_of, in_axes=tuple(axes), out_axes=out)(*arrays)
+            jax.vmap(coefficients_of, in_axes=tuple(axes), out_axes=lane_axes)(*arrays)
             if arrays
             else coefficients_of()
         )
@@ -159,12 +169,12 @@ class Problem(NamedTuple):
         # product for all bodies of a chunk out of a product in a user's function.
         def of_one(coefficients, levels, t, y):
             *rates, margins, new_levels = run(
-                *stacks.apart(coefficients), levels, t, *(y[i][None] for i in range(size))
+                *stacks.unstack(coefficients), levels, t, *(y[i][None] for i in range(size))
             )
             return jnp.concatenate(rates), margins, new_levels
 
         def rates(coefficients, levels, t, y):
-            return jax.vmap(of_one, in_axes=(out, -1, 0, -1), out_axes=-1)(
+            return jax.vmap(of_one, in_axes=(lane_axes, -1, 0, -1), out_axes=-1)(
                 coefficients, levels, t, y
             )
 
@@ -179,8 +189,8 @@ class Problem(NamedTuple):
             )
 
         jumps = *self.switches.jumps[: count - self.events].tolist(), *[False] * self.events
-        swift = self.switches.jumps | self.switches.timed
-        swift[count - self.events :] = True
+        resolved_switches = self.switches.jumps | self.switches.timed
+        resolved_switches[count - self.events :] = True
         return Motion(
             rates,
             levels,
@@ -192,8 +202,8 @@ class Problem(NamedTuple):
             count,
             self.events,
             jumps if any(jumps) else (),
-            tuple(np.flatnonzero(swift).tolist()),
-            is_holdable(field.jaxpr),
+            tuple(np.flatnonzero(resolved_switches).tolist()),
+            is_fusible(field.jaxpr),
         )
 
     def _specialised(self) -> "_Specialised":
@@ -226,8 +236,8 @@ class Problem(NamedTuple):
             return list(specialised.coefficients)
 
         prepared = jax.make_jaxpr(coefficients_of)(*single_lane)
-        depends = _depends(prepared.jaxpr, self.lanes)
-        kinds = [(moves, x.shape, x.dtype) for moves, x in zip(depends, prepared.out_avals)]
+        depends = dependent_results(prepared.jaxpr, self.lanes)
+        kinds = [(is_lane, x.shape, x.dtype) for is_lane, x in zip(depends, prepared.out_avals)]
         return _Specialised(prepared, fields[0], kinds)
 
 
@@ -242,7 +252,7 @@ class _Specialised(NamedTuple):
     kinds: list[tuple]
 
 
-class _Marked(NamedTuple):
+class _LeafAndLane(NamedTuple):
     value: Any
     lane: Any
 
@@ -256,14 +266,14 @@ class _Stacks:
         self.members = [[i for i, x in enumerate(kinds) if x == kind] for kind in self.kinds]
         self.count = len(kinds)
 
-    def of(self, arrays: Sequence[Any]) -> list[Any]:
+    def stack(self, arrays: Sequence[Any]) -> list[Any]:
         """One stack for each kind; a single array of its kind is not stacked."""
         return [
             jnp.stack([arrays[i] for i in members]) if len(members) > 1 else arrays[members[0]]
             for members in self.members
         ]
 
-    def apart(self, stacks: Sequence[Any]) -> list[Any]:
+    def unstack(self, stacks: Sequence[Any]) -> list[Any]:
         """The arrays in their order."""
         arrays: list[Any] = [None] * self.count
         for stack, members in zip(stacks, self.members, strict=True):
@@ -277,25 +287,3 @@ class _Stacks:
             for i, part in zip(members, parts, strict=True):
                 arrays[i] = part
         return arrays
-
-
-def _with_consts_as_operands(
-    closed_jaxpr: ClosedJaxpr, variable_count: int
-) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program with its closed-over values as first operands and the first ``variable_count``
-    operands (time and state) as last ones; and the closed-over values."""
-    jaxpr = closed_jaxpr.jaxpr
-    invars = [*jaxpr.constvars, *jaxpr.invars[variable_count:], *jaxpr.invars[:variable_count]]
-    names = jaxpr.debug_info._replace(arg_names=("",) * len(invars))
-    return ClosedJaxpr(jaxpr.replace(constvars=[], invars=invars, debug_info=names), []), list(
-        closed_jaxpr.consts
-    )
-
-
-def _depends(jaxpr, flags: Sequence[bool]) -> list[bool]:
-    """Which results of a program depend on the arguments with a true flag."""
-    dependent_vars = {v for v, flag in zip(jaxpr.invars, flags) if flag}
-    for eqn in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in dependent_vars for v in eqn.invars):
-            dependent_vars.update(eqn.outvars)
-    return [not isinstance(v, Literal) and v in dependent_vars for v in jaxpr.outvars]

@@ -1,4 +1,4 @@
-"""Derivatives of the steps of ``_turn.py``, in both modes, through the switches that end them.
+"""Derivatives of the steps of ``_iteration.py``, in both modes, through the switches that end them.
 
 With fixed levels a step is a smooth map, and its derivative is that of an ordinary Runge-Kutta step
 of fixed width. At a switch, at the time tau, the rates change from f to f'. A small change of the
@@ -10,7 +10,7 @@ tolerance.
 
 *Forward mode* differentiates the loop; the time of each switch gets its derivative from two steps
 of Newton's method. *Reverse mode* processes recorded steps (state, levels and time) in reverse
-order. The first ``RECORDED_TURNS`` iterations of the loop are recorded while the values are
+order. The first ``RECORDED_ITERATIONS`` iterations of the loop are recorded while the values are
 computed. If there are more, the motion is integrated once more: the maximum number of attempts is
 divided into ``RECORD_SEGMENTS`` equal segments, and the carry of the loop is stored at the start of
 each (checkpoint). Only one segment is recorded at a time, so that all segments but the last are
@@ -38,26 +38,34 @@ from polhode._integrate._explicit_step import (
     weighted,
 )
 from polhode._integrate._field import REVERSE_ONCE
+from polhode._integrate._iteration import FINISHED, advance, has_own_root, min_snap_time
 from polhode._integrate._loop import (
-    Make,
+    MakeMotion,
     Note,
     Solved,
-    begin,
-    each_body,
+    broadcast_times,
+    compact,
+    empty_rows,
+    initial_carry,
     is_any_running,
-    noted,
-    packed,
-    put_in,
-    room_for,
+    note_of,
     run,
     solve,
+    with_row,
 )
-from polhode._integrate._turn import FINISHED, advance, snap_reach, turns_by_itself
-from polhode._kernels import any_of, attached, is_slope, kernel, linear, most_of, zeros
+from polhode._kernels import (
+    any_of,
+    is_nonzero_tangent,
+    kernel,
+    linear,
+    max_over_batch,
+    with_derivative_rule,
+    zeros,
+)
 
 
 def samples(
-    make: Make,
+    make_motion: MakeMotion,
     arrays,
     unit_data,
     y,
@@ -65,33 +73,33 @@ def samples(
     ts,
     states: Array,
     solved: Solved,
-    turns: int = 0,
-    once: bool = False,
+    iterations: int = 0,
+    first_order_only: bool = False,
 ) -> tuple[Array, Solved]:
     """``states`` with their derivatives, and ``solved``.
 
     ``states`` (B, T, D): samples at ``ts`` (T,) or (B, T), in any order, of the motion from ``y``
-    (D, B) at ``start`` () or (B,). In a program that computes derivatives and with ``turns``, both
-    come from an integration that records the first ``turns`` iterations. ``once``: raise an error
-    for second derivatives."""
+    (D, B) at ``start`` () or (B,). In a program that computes derivatives and with ``iterations``,
+    both come from an integration that records the first ``iterations`` iterations.
+    ``first_order_only``: raise an error for second derivatives."""
     leaves, tree = jax.tree.flatten(unit_data)
     size, end = len(arrays), len(arrays) + len(leaves)
 
     def problem_of(operands, differentiable=False):
         unit_data = jax.tree.unflatten(tree, operands[size:end])
-        return make(operands[:size], unit_data, differentiable)
+        return make_motion(operands[:size], unit_data, differentiable)
 
-    def again(operands):
+    def recompute(operands):
         *inputs, y, start, ts = operands
         unit_data = jax.tree.unflatten(tree, inputs[size:])
-        solved, record = solve(make, inputs[:size], unit_data, start, ts, y, turns)
+        solved, record = solve(make_motion, inputs[:size], unit_data, start, ts, y, iterations)
         return [solved.states, *jax.tree.leaves(solved._replace(samples=None))], record
 
     def rule(operands, tangents, values, record=None):
         *inputs, y, start, ts = operands
         *input_tangents, dy, dstart, dts = tangents
         motion, _ = problem_of(inputs)
-        starts, rows = each_body(start, ts, y.shape[1])
+        starts, rows = broadcast_times(start, ts, y.shape[1])
         order = None
         states, ordered_ts = values[0], ts
         # The times of a body may be in any order (`Trajectory.at`); the loop needs them sorted.
@@ -100,21 +108,21 @@ def samples(
             order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
             ordered_ts = jnp.take_along_axis(ts, order, axis=1)
             states = jnp.take_along_axis(states, order[..., None], axis=1)
-        at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
-        dy = dy if is_slope(dy) else zeros(dy)
+        at = [i for i, x in enumerate(input_tangents[:size]) if is_nonzero_tangent(x)]
+        dy = dy if is_nonzero_tangent(dy) else zeros(dy)
         # Derivatives by times need no integration: a change of the start time is equivalent to a
         # change of the initial state against the rates, and a sample moves along the rates.
-        if is_slope(dstart):
+        if is_nonzero_tangent(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         recorded, record_tree = jax.tree.flatten(record)
         count = len(operands)
 
-        def tangent(known, tangents):
-            return _tangent(problem_of, at, _checked(known[:count], once), tangents)
+        def tangent(constants, tangents):
+            return _tangent(problem_of, at, _checked(constants[:count], first_order_only), tangents)
 
-        def cotangent(known, cotangents):
-            record = jax.tree.unflatten(record_tree, known[count:])
-            primals = _checked(known[:count], once)
+        def cotangent(constants, cotangents):
+            record = jax.tree.unflatten(record_tree, constants[count:])
+            primals = _checked(constants[:count], first_order_only)
             return _cotangent(problem_of, at, primals, record, cotangents[0])
 
         change = linear(
@@ -123,25 +131,27 @@ def samples(
             [*inputs, y, start, ordered_ts, *recorded],
             [dy, *(input_tangents[i] for i in at)],
             [states],
-            partial(kernel, of_units=True) if motion.is_whole else None,
+            partial(kernel, of_units=True) if motion.is_fusible else None,
             REVERSE_ONCE,
         )
         if order is not None:
             place = jnp.argsort(order, axis=1)[..., None]
             change = [jnp.take_along_axis(change[0], place, axis=1)]
-        if is_slope(dts):
+        if is_nonzero_tangent(dts):
             rate = _rates(motion, rows, jnp.moveaxis(values[0], 0, -1))
-            dtimes = each_body(start, dts, y.shape[1])[1]
+            dtimes = broadcast_times(start, dts, y.shape[1])[1]
             change = [change[0] + jnp.moveaxis(dtimes[:, None] * rate, -1, 0)]
         return change
 
-    others, tree_of_others = jax.tree.flatten(solved._replace(samples=None))
-    operands, values = [*arrays, *leaves, y, start, ts], [states, *others]
-    states, *others = attached(rule, operands, values, again if turns else None)
-    return states, jax.tree.unflatten(tree_of_others, others)
+    other_results, result_tree = jax.tree.flatten(solved._replace(samples=None))
+    operands, values = [*arrays, *leaves, y, start, ts], [states, *other_results]
+    states, *other_results = with_derivative_rule(
+        rule, operands, values, recompute if iterations else None
+    )
+    return states, jax.tree.unflatten(result_tree, other_results)
 
 
-def segment_turns(max_steps: int) -> int:
+def segment_iterations(max_steps: int) -> int:
     """Iterations of the loop from one checkpoint to the next."""
     return -(-control.ATTEMPTS * max_steps // _policy.RECORD_SEGMENTS)
 
@@ -150,10 +160,10 @@ def _is_differentiated(operands) -> bool:
     return any(isinstance(x, ad.JVPTracer) for x in operands)
 
 
-def _checked(operands, once: bool):
-    """The operands of a derivative; raises an error if ``once`` and they are differentiated
-    again."""
-    if once and _is_differentiated(operands):
+def _checked(operands, first_order_only: bool):
+    """The operands of a derivative; raises an error if ``first_order_only`` and they are
+    differentiated again."""
+    if first_order_only and _is_differentiated(operands):
         raise NotImplementedError(
             "second derivatives of steps that pass kinks or jumps are wrong: leave"
             " method=ph.CoarseSteps() out, so that the steps end there."
@@ -181,7 +191,7 @@ def _tangent(problem_of, at, primals, tangents):
         for i, x in zip(at, parameters):
             inputs[i] = x
         motion, options = problem_of(inputs, True)
-        _, rows, _ = run(motion, options, *each_body(start, ts, y.shape[1]), y)
+        _, rows, _ = run(motion, options, *broadcast_times(start, ts, y.shape[1]), y)
         return rows.samples.reshape(y.shape[1], ts.shape[-1] + 1, -1)[:, :-1]
 
     def tangent(primals, tangents):
@@ -194,7 +204,7 @@ def _tangent(problem_of, at, primals, tangents):
 def _cotangent(problem_of, at, primals, record, cotangents):
     """Cotangents of the state at the start and of ``arrays[i]``, i in ``at``."""
     *arrays, y, start, ts = primals
-    start, times = each_body(start, ts, y.shape[1])
+    start, times = broadcast_times(start, ts, y.shape[1])
     cotangents = jnp.moveaxis(cotangents, 0, -1)  # (T, D, B)
     parameters = [arrays[i] for i in at]
 
@@ -214,7 +224,7 @@ def _cotangent(problem_of, at, primals, record, cotangents):
     # Cotangents of the loop's coefficients are summed over steps and bodies as they arise, so that
     # weights of a network common to all bodies have one cotangent. At the end they are pulled back
     # to the parameters, once.
-    _, pull = jax.vjp(coefficients_of, *parameters)
+    _, pullback = jax.vjp(coefficients_of, *parameters)
     sums = [jnp.zeros_like(motion.coefficients[k]) for k in floats]
 
     def backward(coefficients, arguments, unit_data, *operands):
@@ -223,7 +233,7 @@ def _cotangent(problem_of, at, primals, record, cotangents):
         )
         return _backward(bound_motion, options, floats, *operands)
 
-    y_cotangent, sums = (kernel(backward) if motion.is_whole else backward)(
+    y_cotangent, sums = (kernel(backward) if motion.is_fusible else backward)(
         motion.coefficients,
         motion.arguments,
         motion.unit_data,
@@ -234,54 +244,56 @@ def _cotangent(problem_of, at, primals, record, cotangents):
         sums,
         record,
     )
-    return [y_cotangent, *pull(sums)]
+    return [y_cotangent, *pullback(sums)]
 
 
 def _backward(motion, options, floats, start, times, y, cotangents, sums, record):
     """Cotangents of the state at the start and of the floats among ``motion.coefficients``."""
-    first_progress, rows = begin(motion, options, start, times[-1:], y)
+    first_progress, rows = initial_carry(motion, options, start, times[-1:], y)
     end = times[-1:]
-    length = segment_turns(options.max_steps)
+    length = segment_iterations(options.max_steps)
 
-    def stored(progress):
+    def checkpoint_of(progress):
         """The carry as a checkpoint, without rates and margins. These are evaluated again at the
         start of a segment, in both integrations, so that both take the same steps. All numbers are
         in one array, because each array of a checkpoint takes three operations in every
         iteration."""
         numbers = [progress._asdict()[name].astype(y.dtype) for name in _NUMBERS]
-        levels, just_turned = (packed(motion, x) for x in (progress.levels, progress.just_turned))
-        return jnp.concatenate([progress.y, jnp.stack(numbers)]), levels, just_turned
+        levels, just_flipped = (
+            compact(motion, x) for x in (progress.levels, progress.just_flipped)
+        )
+        return jnp.concatenate([progress.y, jnp.stack(numbers)]), levels, just_flipped
 
-    def restored(checkpoint):
+    def from_checkpoint(checkpoint):
         rows, *switches = checkpoint
-        levels, just_turned = (x.astype(y.dtype) for x in switches)
+        levels, just_flipped = (x.astype(y.dtype) for x in switches)
         like = first_progress._asdict()
         numbers = {
             name: row.astype(like[name].dtype)
             for name, row in zip(_NUMBERS, rows[y.shape[0] :], strict=True)
         }
         return first_progress._replace(
-            y=rows[: y.shape[0]], levels=levels, just_turned=just_turned, **numbers
+            y=rows[: y.shape[0]], levels=levels, just_flipped=just_flipped, **numbers
         )
 
     def entry(rows, k):
         return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, k, 0, False), rows)
 
-    def choose(where, a, b):
+    def select(where, a, b):
         return jax.tree.map(lambda a, b: jnp.where(where, a, b), a, b)
 
-    def turn(carry):
+    def iterate(carry):
         progress, checkpoints, notes, count = carry
         number, place = count // length, count % length
         is_segment_start = place == 0
         progress = progress._replace(needs_rates=progress.needs_rates | is_segment_start)
-        checkpoint = choose(is_segment_start, stored(progress), entry(checkpoints, number))
-        checkpoints = put_in(checkpoints, number, checkpoint)
-        notes = put_in(notes, place, noted(motion, progress))
+        checkpoint = select(is_segment_start, checkpoint_of(progress), entry(checkpoints, number))
+        checkpoints = with_row(checkpoints, number, checkpoint)
+        notes = with_row(notes, place, note_of(motion, progress))
         progress, _ = advance(motion, options, start, end, progress, rows)
         return progress, checkpoints, notes, count + 1
 
-    def sound(finished, note):
+    def replace_failed(finished, note):
         # The rates of a body that failed may be NaN, and zero cotangents times NaN would be added
         # to coefficients shared with other bodies. Its state is replaced by that of a body that
         # finished.
@@ -294,50 +306,52 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     # In its first iteration this loop integrates to the end of the motion, and processes the last
     # segment. In the following ones it integrates earlier segments again, each from its checkpoint.
     def segment(carry):
-        number, count, stop, checkpoints, notes, finished, after, later, *sums_so_far = carry
+        number, count, stop, checkpoints, notes, finished, after, later_levels, *sums_so_far = carry
         progress, checkpoints, notes, count = jax.lax.while_loop(
             lambda c: is_any_running(c[0]) & (c[3] < stop),
-            turn,
-            (restored(entry(checkpoints, number)), checkpoints, notes, count),
+            iterate,
+            (from_checkpoint(entry(checkpoints, number)), checkpoints, notes, count),
         )
         is_last = stop == _NEVER
         finished = jnp.where(is_last, progress.outcome == FINISHED, finished)
-        after = choose(is_last, sound(finished, noted(motion, progress)), after)
+        after = select(is_last, replace_failed(finished, note_of(motion, progress)), after)
         if motion.jumps:
-            later = jnp.where(is_last, after.levels, later)
+            later_levels = jnp.where(is_last, after.levels, later_levels)
         number = (count - 1) // length
-        turns = count - number * length
+        iterations = count - number * length
 
-        def back(i, carry):
-            place = turns - 1 - i
-            note = entry(notes, place)
+        def reverse(i, carry):
+            index = iterations - 1 - i
+            note = entry(notes, index)
             if record is not None:
-                note = choose(place < recorded_turns, note, record.last)
-            note = sound(finished, note)
-            return _step_back(motion, floats, start, times, cotangents, finished, note, *carry)
+                note = select(index < recorded_iterations, note, record.last)
+            note = replace_failed(finished, note)
+            return _reverse_step(motion, floats, start, times, cotangents, finished, note, *carry)
 
-        carry = jax.lax.fori_loop(0, turns, back, (after, later, *sums_so_far))
-        before = number * length
-        return number - 1, before - length, before, checkpoints, notes, finished, *carry
+        carry = jax.lax.fori_loop(0, iterations, reverse, (after, later_levels, *sums_so_far))
+        first = number * length
+        return number - 1, first - length, first, checkpoints, notes, finished, *carry
 
-    first = stored(first_progress)
-    note = noted(motion, first_progress)
-    notes, count = room_for(length, note), jnp.zeros((), jnp.int32)
+    checkpoint = checkpoint_of(first_progress)
+    note = note_of(motion, first_progress)
+    notes, count = empty_rows(length, note), jnp.zeros((), jnp.int32)
     if record is not None:
         # If all iterations are recorded, integration starts with every body stopped and takes none.
-        room = record.notes.elapsed.shape[0]
-        is_complete = most_of(record.turns) <= room
+        capacity = record.notes.elapsed.shape[0]
+        is_complete = max_over_batch(record.iterations) <= capacity
         # Under ``vmap``, chunks of bodies may have been integrated one after another, with
         # different numbers of iterations. After its last iteration a chunk does not change.
-        recorded_turns = jnp.where(is_complete, record.turns, _NEVER)
-        notes = jax.tree.map(lambda x, r: jnp.concatenate([r, x[room:]]), notes, record.notes)
-        count = jnp.where(is_complete, most_of(record.turns), 0)
+        recorded_iterations = jnp.where(is_complete, record.iterations, _NEVER)
+        notes = jax.tree.map(lambda x, r: jnp.concatenate([r, x[capacity:]]), notes, record.notes)
+        count = jnp.where(is_complete, max_over_batch(record.iterations), 0)
         levels = record.last.levels.astype(y.dtype)
         after_all = first_progress._replace(
             **record.last._replace(levels=levels)._asdict(), outcome=record.outcome
         )
-        first = choose(is_complete, stored(after_all), first)
-    checkpoints = put_in(room_for(_policy.RECORD_SEGMENTS, first), jnp.zeros_like(count), first)
+        checkpoint = select(is_complete, checkpoint_of(after_all), checkpoint)
+    checkpoints = with_row(
+        empty_rows(_policy.RECORD_SEGMENTS, checkpoint), jnp.zeros_like(count), checkpoint
+    )
     carry = (
         jnp.zeros_like(count),
         count,
@@ -354,23 +368,23 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     carry = jax.lax.while_loop(lambda c: c[2] > 0, segment, carry)
     *_, finished, _, _, cotangent, sums, _ = carry
     # zero, or NaN where the cotangents are NaN, as they are if no body of the call finished
-    nothing = 0 * jnp.sum(cotangents[0] + cotangents[-1], axis=0)
+    zero_or_nan = 0 * jnp.sum(cotangents[0] + cotangents[-1], axis=0)
     any_finished = jnp.sum(jnp.where(finished, 1, 0)) > 0
     return (
-        jnp.where(finished[None], cotangent, nothing),
-        [jnp.where(any_finished, x, jnp.sum(nothing).astype(x.dtype)) for x in sums],
+        jnp.where(finished[None], cotangent, zero_or_nan),
+        [jnp.where(any_finished, x, jnp.sum(zero_or_nan).astype(x.dtype)) for x in sums],
     )
 
 
 _NEVER = jnp.iinfo(jnp.int32).max
 """A number of iterations that no motion takes."""
 
-_ARRAYS = "y", "rate", "levels", "margin", "just_turned"
+_ARRAYS = "y", "rate", "levels", "margin", "just_flipped"
 _NUMBERS = tuple(name for name in Progress._fields if name not in _ARRAYS)
 """Fields of the carry of the loop that are one number for each body."""
 
 
-def _step_back(
+def _reverse_step(
     motion,
     floats,
     start,
@@ -379,28 +393,29 @@ def _step_back(
     finished,
     note: Note,
     after: Note,
-    later,
+    later_levels,
     cotangent,
     sums,
     place,
 ):
     """From cotangents after an iteration of the loop to those before it.
 
-    ``later``: the levels with which the motion continues from ``after``, including corrections of
-    levels that depend on the switch that turned (of a search in a table every comparison but the
-    first); ``place`` (B,): index of the last sample that has not been processed yet."""
+    ``later_levels``: the levels with which the motion continues from ``after``, including
+    corrections of levels that depend on the switch that flipped (of a search in a table every
+    comparison but the first); ``place`` (B,): index of the last sample that has not been processed
+    yet."""
     levels = note.levels.astype(cotangent.dtype)
     sign = jnp.where(times[-1] < start, -1, 1).astype(cotangent.dtype)
     t = start + sign * note.elapsed
     h = sign * (after.elapsed - note.elapsed)
-    has_turned = jnp.any(note.levels != after.levels, axis=0)
+    has_flipped = jnp.any(note.levels != after.levels, axis=0)
     # At a switch beyond which the field is undefined, the state moves without a step: see `_snap`
-    # in `_turn.py`.
+    # in `_iteration.py`.
     length, eps = jnp.abs(times[-1] - start), float(jnp.finfo(cotangent.dtype).eps)
-    is_snap = has_turned & (jnp.abs(h) <= 2 * snap_reach(note.elapsed, length, eps))
-    live = finished & ((h != 0) | has_turned)
+    is_snap = has_flipped & (jnp.abs(h) <= 2 * min_snap_time(note.elapsed, length, eps))
+    active = finished & ((h != 0) | has_flipped)
     end = t + h
-    h = jnp.where(live & ~is_snap, h, 0)
+    h = jnp.where(active & ~is_snap, h, 0)
 
     def rates_of(parameters, levels, t, y):
         coefficients = list(motion.coefficients)
@@ -410,19 +425,31 @@ def _step_back(
 
     values = [motion.coefficients[k] for k in floats]
     if motion.jumps:
-        pulled, parameter_cotangents, is_correction = _jump_back(
-            rates_of, values, motion, note, after, later, end, length, cotangent, live, is_snap
+        jump, parameter_cotangents, is_correction = _switch_cotangents(
+            rates_of,
+            values,
+            motion,
+            note,
+            after,
+            later_levels,
+            end,
+            length,
+            cotangent,
+            active,
+            is_snap,
         )
-        later = jnp.where(is_correction[None], later, note.levels)
-        cotangent, sums = cotangent + pulled, [a + b for a, b in zip(sums, parameter_cotangents)]
+        later_levels = jnp.where(is_correction[None], later_levels, note.levels)
+        cotangent, sums = cotangent + jump, [a + b for a, b in zip(sums, parameter_cotangents)]
 
     def has_sample(place):
         sample_time = jnp.abs(column(times, place) - start)
-        return live & (place >= 0) & (h != 0) & ((sample_time > note.elapsed) | (note.elapsed == 0))
+        return (
+            active & (place >= 0) & (h != 0) & ((sample_time > note.elapsed) | (note.elapsed == 0))
+        )
 
     rule, dtype = motion.rule, cotangent.dtype
     table, nodes = in_parts(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
-    top = jnp.where(
+    stage_count = jnp.where(
         any_of(jnp.where(has_sample(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1
     )
 
@@ -434,32 +461,34 @@ def _step_back(
 
     def linearised(i, rates):
         y = note.y + h[None] * weighted([part[i] for part in table], rates)
-        rate, pull = jax.vjp(
+        rate, pullback = jax.vjp(
             lambda parameters, y: rates_of(parameters, levels, t + nodes[i] * h, y)[0], values, y
         )
-        arrays, build = _taken_apart(pull, [*values, levels, t, h])
+        arrays, build = _stacked_residuals(pullback, [*values, levels, t, h])
         rebuild.append(build)  # the same in every trace
         return rate, arrays
 
     def stage(i, carry):
         rates, residuals = carry
         rate, arrays = linearised(i, rates)
-        put_in = jax.lax.dynamic_update_index_in_dim
-        residuals = [put_in(rows, x, i, 0) for rows, x in zip(residuals, arrays, strict=True)]
-        return put_in(rates, rate, i, 0), residuals
+        update = jax.lax.dynamic_update_index_in_dim
+        residuals = [update(rows, x, i, 0) for rows, x in zip(residuals, arrays, strict=True)]
+        return update(rates, rate, i, 0), residuals
 
     buffers = jnp.zeros((rule.dense_stages, *cotangent.shape), cotangent.dtype)
     _, shapes = jax.eval_shape(linearised, 0, buffers)
     residuals = [jnp.zeros((rule.dense_stages, *x.shape), x.dtype) for x in shapes]
-    _, residuals = jax.lax.fori_loop(0, top, stage, (buffers, residuals))
+    _, residuals = jax.lax.fori_loop(0, stage_count, stage, (buffers, residuals))
 
     def sample(carry):
         place, cotangent, bars = carry
         in_step = has_sample(place)
         x = jnp.abs(column(times, place) - start) - note.elapsed
         x = jnp.minimum(x / jnp.where(h != 0, jnp.abs(h), 1), 1)
-        _, pull = jax.vjp(lambda y, k: dense_state(y, dense_of(h, k, rule), x), note.y, buffers)
-        y_cotangent, stage_cotangents = pull(jnp.where(in_step[None], column(cotangents, place), 0))
+        _, pullback = jax.vjp(lambda y, k: dense_state(y, dense_of(h, k, rule), x), note.y, buffers)
+        y_cotangent, stage_cotangents = pullback(
+            jnp.where(in_step[None], column(cotangents, place), 0)
+        )
         return (
             place - jnp.where(in_step, 1, 0).astype(place.dtype),
             cotangent + y_cotangent,
@@ -477,25 +506,27 @@ def _step_back(
         (place, initial_cotangent, bars),
     )
 
-    def back(j, carry):
+    def reverse_stage(j, carry):
         bars, cotangent, sums = carry
-        i = top - 1 - j
+        i = stage_count - 1 - j
         bar = jax.lax.dynamic_index_in_dim(bars, i, 0, False)
-        pull = rebuild[-1]([jax.lax.dynamic_index_in_dim(rows, i, 0, False) for rows in residuals])
-        parameter_cotangents, change = pull(bar)
+        pullback = rebuild[-1](
+            [jax.lax.dynamic_index_in_dim(rows, i, 0, False) for rows in residuals]
+        )
+        parameter_cotangents, change = pullback(bar)
         bars = bars + (h[None] * change)[None] * table[0][i][:, None, None]
-        return bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)]
+        return (bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)])
 
-    _, cotangent, sums = jax.lax.fori_loop(0, top, back, (bars, cotangent, sums))
-    return note, later, cotangent, sums, place
+    _, cotangent, sums = jax.lax.fori_loop(0, stage_count, reverse_stage, (bars, cotangent, sums))
+    return note, later_levels, cotangent, sums, place
 
 
-def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]:
-    """The arrays in a linear map of ``jax.vjp`` (its residuals) without those in ``known``, and a
-    function that builds the map from them. Arrays of one shape are stacked: a field written in
-    components has about a hundred of them, each with one number for every body."""
+def _stacked_residuals(linear_map, shared_arrays: list[Array]) -> tuple[list[Array], Callable]:
+    """The arrays in a linear map of ``jax.vjp`` (its residuals) without those in ``shared_arrays``,
+    and a function that builds the map from them. Arrays of one shape are stacked: a field written
+    in components has about a hundred of them, each with one number for every body."""
     leaves, structure = jax.tree.flatten(linear_map)
-    numbers = {id(x): k for k, x in enumerate(known)}
+    numbers = {id(x): k for k, x in enumerate(shared_arrays)}
     residuals = [x for x in leaves if id(x) not in numbers]
     kinds = list(dict.fromkeys((x.shape, x.dtype) for x in residuals))
     groups = [[x for x in residuals if (x.shape, x.dtype) == kind] for kind in kinds]
@@ -503,7 +534,7 @@ def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]
     def rebuild(stacks):
         rows = [iter([stack[i] for i in range(stack.shape[0])]) for stack in stacks]
         arrays = [
-            known[numbers[id(x)]]
+            shared_arrays[numbers[id(x)]]
             if id(x) in numbers
             else next(rows[kinds.index((x.shape, x.dtype))])
             for x in leaves
@@ -513,46 +544,56 @@ def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]
     return [jnp.stack(group) for group in groups], rebuild
 
 
-def _jump_back(
-    rates_of, values, motion, note: Note, after: Note, later, t, length, cotangent, live, is_snap
+def _switch_cotangents(
+    rates_of,
+    values,
+    motion,
+    note: Note,
+    after: Note,
+    later_levels,
+    t,
+    length,
+    cotangent,
+    active,
+    is_snap,
 ):
     """Contribution of the time of a switch to the cotangents of the state and of ``values`` (the
     saltation term). Also whether the iteration corrected levels that depend on the switch before,
     whose contribution includes theirs."""
     flips = note.levels != after.levels
-    flips = jnp.where(jnp.any(flips, axis=0), flips, after.levels != later)
+    flips = jnp.where(jnp.any(flips, axis=0), flips, after.levels != later_levels)
     # events do not change the rates
-    field = jnp.arange(motion.switches) < motion.switches - motion.events
-    flips = flips & field[:, None]
+    affects_rates = jnp.arange(motion.switches) < motion.switches - motion.events
+    flips = flips & affects_rates[:, None]
     # beyond the switch the field with the previous levels may be undefined
     y_before = jnp.where(is_snap[None], note.y, after.y)
     rates_before, *_ = rates_of(values, note.levels, t, y_before)
-    margins, slopes = jax.jvp(
+    margins, margin_rates = jax.jvp(
         lambda t, y: rates_of(values, note.levels, t, y)[1],
         (t, y_before),
         (jnp.ones_like(t), rates_before),
     )
-    stands_alone = jnp.any(flips & turns_by_itself(margins, slopes, length), axis=0)
+    stands_alone = jnp.any(flips & has_own_root(margins, margin_rates, length), axis=0)
     is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0) & ~stands_alone
-    flips = flips & (live & ~is_correction)[None]
-    share = jnp.where(flips, 1, 0).astype(cotangent.dtype)
-    share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
-    # Switches that turn together contribute equal shares: their margins vanish at the same time
+    flips = flips & (active & ~is_correction)[None]
+    weights = jnp.where(flips, 1, 0).astype(cotangent.dtype)
+    weights = weights / jnp.maximum(jnp.sum(weights, axis=0, keepdims=True), 1)
+    # Switches that flip together contribute equal shares: their margins vanish at the same time
     # only if the same comparison occurs several times, or by symmetry.
-    rates_after, *_ = rates_of(values, later, t, after.y)
+    rates_after, *_ = rates_of(values, later_levels, t, after.y)
 
     def margin(parameters, t, y):
         return jnp.sum(
-            jnp.where(flips, share * rates_of(parameters, note.levels, t, y)[1], 0), axis=0
+            jnp.where(flips, weights * rates_of(parameters, note.levels, t, y)[1], 0), axis=0
         )
 
-    rate = jnp.sum(jnp.where(flips, share * slopes, 0), axis=0)
+    margin_rate = jnp.sum(jnp.where(flips, weights * margin_rates, 0), axis=0)
     # If the margin has zero time derivative at its root (grazing), the time of the switch has no
     # derivative; it is treated as fixed.
-    crosses_surface = jnp.any(flips, axis=0) & (rate != 0)
+    crosses_surface = jnp.any(flips, axis=0) & (margin_rate != 0)
     weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0) / jnp.where(
-        crosses_surface, rate, 1
+        crosses_surface, margin_rate, 1
     )
-    _, pull = jax.vjp(lambda parameters, y: margin(parameters, t, y), values, y_before)
-    parameter_cotangents, change = pull(jnp.where(crosses_surface, weight, 0))
-    return change, parameter_cotangents, is_correction
+    _, pullback = jax.vjp(lambda parameters, y: margin(parameters, t, y), values, y_before)
+    parameter_cotangents, state_cotangent = pullback(jnp.where(crosses_surface, weight, 0))
+    return state_cotangent, parameter_cotangents, is_correction

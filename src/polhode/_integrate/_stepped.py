@@ -22,23 +22,23 @@ from polhode._failed import where_lost
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, natural_rates
 from polhode._integrate._diffrax_solve import (
-    WAY_BACK,
+    MIN_ADJOINT_INTERVALS,
     Request,
     Solution,
     in_segments,
     with_restarts,
 )
 from polhode._integrate._extrapolation import Automatic, Extrapolation
-from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
+from polhode._integrate._flow_adjoint import FlowAdjoint, path_with_derivatives
 from polhode._integrate._flow_derivative import equations_of
-from polhode._integrate._loop import Found, Search, solve, with_events
+from polhode._integrate._iteration import LoopOptions
+from polhode._integrate._loop import LocatedEvents, Search, samples_and_events, solve
 from polhode._integrate._midpoint import Progress
 from polhode._integrate._problem import Problem
-from polhode._integrate._step_derivative import samples, segment_turns
-from polhode._integrate._switches import guarded
+from polhode._integrate._step_derivative import samples, segment_iterations
+from polhode._integrate._switches import raising_on_hidden_switches
 from polhode._integrate._tableau import TSIT5
-from polhode._integrate._turn import LoopOptions
-from polhode._kernels import Distinct, is_holdable, kernel, map_chunks
+from polhode._kernels import Distinct, is_fusible, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -96,8 +96,8 @@ class AbstractIntegration(AbstractMethod):
             if isinstance(self.solver, Extrapolation) or not may_jump(scene):
                 return name
             return f"{name}, which pass jumps of a torque and may then miss rtol"
-        few, switches, hidden_operations = self._are_few(scene, state), 0, ()
-        if few or may_jump(scene):
+        is_few, switches, hidden_operations = self._are_few(scene, state), 0, ()
+        if is_few or may_jump(scene):
             program: list[Problem] = []
 
             def trace(scene, state, ts):
@@ -117,7 +117,7 @@ class AbstractIntegration(AbstractMethod):
                 "extrapolated midpoint rule, searched for jumps: the torque contains"
                 f" {', '.join(hidden_operations)}, in which kinks cannot be located"
             )
-        if few or switches:
+        if is_few or switches:
             ending = f", each ending where one of {switches} switches (clip, where, ...) changes"
             order = 5 if self._automatic.rule(switches) is TSIT5 else 8
             return f"explicit Runge-Kutta steps of order {order}" + (ending if switches else "")
@@ -178,23 +178,25 @@ class AbstractIntegration(AbstractMethod):
             linearised = isinstance(self.adjoint, FlowAdjoint)
             unit = kernel(solve_chunk, linearised=linearised, of_units=True)
             solve_all = unit if n <= _policy.KERNEL_BODIES else solve_chunk
-            return guarded(solve_all(Distinct((lanes, times))), hidden)
+            return raising_on_hidden_switches(solve_all(Distinct((lanes, times))), hidden)
         # chunks of bodies with similar rates, those with most steps first, so that in a work queue
         # the last bodies to start need few
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
         results = map_chunks(solve_chunk, sorted_lanes, n, size)
-        return guarded(jax.tree.map(lambda x: x[jnp.argsort(order)], results), hidden)
+        return raising_on_hidden_switches(
+            jax.tree.map(lambda x: x[jnp.argsort(order)], results), hidden
+        )
 
     def _initial_state(self, scene, state, ts, record: Record):
         """The initial state, with zero work if it is recorded, and whether the coordinates are
         regular there."""
-        y0, sound = self.chart.start(scene, state, ts[..., 0])
+        y0, is_regular = self.chart.start(scene, state, ts[..., 0])
         if record.work:
             wheels = scene.dynamics.wheels
             loose = () if wheels is None else wheels.loose
             y0 = (*y0, (jnp.zeros_like(y0[0][0]),) * (1 + len(loose)))
-        return y0, sound
+        return y0, is_regular
 
     def _equations(self, scene, state, ts, record: Record):
         """The diffrax term of the equations of motion, and its arguments."""
@@ -239,12 +241,12 @@ class AbstractIntegration(AbstractMethod):
         of 64 take 3 times as long for 50 satellites). If a kernel cannot contain the field, such as
         a network with matrix products, more, to amortise the calls."""
         problem = self._problem(scene, state, ts, record, search)
-        fits = is_holdable(problem.closed_jaxpr.jaxpr)
+        fits = is_fusible(problem.closed_jaxpr.jaxpr)
         return _policy.bodies_at_once(_policy.KERNEL_BODIES if fits else _policy.LANES)
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
-    ) -> tuple[Samples, Found] | None:
+    ) -> tuple[Samples, LocatedEvents] | None:
         """Samples at ``ts`` followed by those at the events, and the events; None if this method
         does not search for events during the integration."""
         if not self._is_automatic or not state.wxyz.shape[0]:
@@ -290,9 +292,9 @@ class AbstractIntegration(AbstractMethod):
 
         def event_values(parts, t, y):
             scene, _ = parts
-            later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+            scene_over_time = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
             y = jax.tree.map(lambda x: x[:, None], tuple(y))
-            wxyz, omega, _ = self.chart.finish(later, y, jnp.reshape(t, (1, 1)))
+            wxyz, omega, _ = self.chart.finish(scene_over_time, y, jnp.reshape(t, (1, 1)))
             return jnp.stack([fn(wxyz[0, 0], omega[0, 0], t) for fn in fns])
 
         def equations(parts):
@@ -306,9 +308,9 @@ class AbstractIntegration(AbstractMethod):
 
     def _solve_by_loop(
         self, scene, state, ts, rtol, record: Record, search: Search | None, n: int
-    ) -> tuple[Samples, Found | None] | None:
+    ) -> tuple[Samples, LocatedEvents | None] | None:
         """One chunk of ``n`` bodies by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
-        y0, sound = self._initial_state(scene, state, ts, record)
+        y0, is_regular = self._initial_state(scene, state, ts, record)
         term, dynamics = self._equations(scene, state, ts, record)
         problem = self._problem(scene, state, ts, record, search)
         if problem.switches.hidden_operations:
@@ -317,57 +319,59 @@ class AbstractIntegration(AbstractMethod):
         rtol = jax.lax.stop_gradient(rtol)
         times = ts[..., -1:] if record.final_only else ts
         unit_data, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
-        searched = Search() if search is None else search
+        event_search = Search() if search is None else search
         rule = self._automatic.rule(problem.switches.count - problem.events)
         program = problem._replace(arrays=[])  # a derivative rule must not close over traced values
-        passing = searched.passing
+        without_storage = event_search.without_storage
 
-        def make(arrays, unit_data, differentiable, searched=passing):
+        def make_motion(arrays, unit_data, differentiable, event_search=without_storage):
             units, rtol = unit_data
             motion = program.motion(arrays, _by_units, units, rule, differentiable)
             return motion, LoopOptions(
                 rtol,
                 self.max_steps,
-                searched.capacity,
-                searched.directions,
-                searched.terminal,
+                event_search.capacity,
+                event_search.directions,
+                event_search.terminal,
                 differentiable,
             )
 
         constants = jax.lax.stop_gradient((problem.arrays, unit_data, start, times, y))
-        loop_result, _ = solve(partial(make, searched=searched), *constants)
+        loop_result, _ = solve(partial(make_motion, event_search=event_search), *constants)
         states, events = loop_result.states, None
         if search is not None:
-            events, times, states = with_events(search, loop_result, times, states)
+            events, times, states = samples_and_events(search, loop_result, times, states)
         # If the exact equations of a damped motion are integrated backwards, errors grow. They do
         # not if the recorded steps are differentiated.
-        recorded = problem.switches.count or not self._automatic.located
-        if recorded or times.ndim > 1 or _torques_act(scene):
+        uses_steps = problem.switches.count or not self._automatic.located
+        if uses_steps or times.ndim > 1 or _torques_act(scene):
             operands = problem.arrays, unit_data, y, start, times, states, loop_result
-            turns = 0
+            iterations = 0
             if search is None and times.ndim == 1:
-                turns = _policy.recorded_turns(n, problem.note_bytes)
-                turns = min(turns, segment_turns(self.max_steps))
-            once = problem.passed_switches > 0
-            states, loop_result = samples(make, *operands, turns=turns, once=once)
+                iterations = _policy.recorded_iterations(n, problem.note_bytes)
+                iterations = min(iterations, segment_iterations(self.max_steps))
+            first_order_only = problem.passed_switches > 0
+            states, loop_result = samples(
+                make_motion, *operands, iterations=iterations, first_order_only=first_order_only
+            )
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
             path = list(jnp.unstack(jnp.swapaxes(states, 0, 1), axis=-1))
-            path = path_of(equations, c, leaves, start, times, path)
+            path = path_with_derivatives(equations, c, leaves, start, times, path)
             states = jnp.swapaxes(jnp.stack(path, axis=-1), 0, 1)
         sample_states = jax.tree.unflatten(tree, jnp.unstack(jnp.swapaxes(states, 0, 1), axis=-1))
         end_state = jax.tree.map(lambda x: x[-1:], sample_states)
         status = jnp.array(_OF_LOOP)[loop_result.outcome]
         solution = Solution(sample_states, end_state, loop_result.steps, status, loop_result.error)
-        return self._samples(scene, solution, times, sound, record), events
+        return self._samples(scene, solution, times, is_regular, record), events
 
     def _solve(self, scene, state, ts, rtol, record: Record, jumps: bool) -> Samples:
         """One chunk of bodies by ``diffrax.diffeqsolve``, between the edges of pulses."""
-        y0, sound = self._initial_state(scene, state, ts, record)
+        y0, is_regular = self._initial_state(scene, state, ts, record)
         save_times = ts[-1:] if record.final_only else ts
         if scene.torque is None or scene.torque.edges is None:
             solution = self._solve_smooth(scene, state, y0, ts, rtol, record, jumps)
-            return self._samples(scene, solution, save_times, sound, record)
+            return self._samples(scene, solution, save_times, is_regular, record)
 
         def scene_with(acting):
             return Scene(scene.inertia, scene.potential, acting, scene.rotors)
@@ -376,19 +380,19 @@ class AbstractIntegration(AbstractMethod):
             term, dynamics = self._equations(scene_with(acting), state, ts, record)
             return term.vf(t, y, dynamics)
 
-        def move(acting, y, times, parts):
+        def solve_segment(acting, y, times, parts):
             segment_scene = scene_with(acting)
-            share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
-            return self._solve_smooth(segment_scene, state, y, times, share, record, jumps)
+            segment_rtol = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
+            return self._solve_smooth(segment_scene, state, y, times, segment_rtol, record, jumps)
 
-        solution = in_segments(move, rates, y0, ts, scene.torque, record.final_only)
-        return self._samples(scene, solution, save_times, sound, record)
+        solution = in_segments(solve_segment, rates, y0, ts, scene.torque, record.final_only)
+        return self._samples(scene, solution, save_times, is_regular, record)
 
     def _solve_smooth(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Solution:
         """The solution from ``y0`` through ``ts``: the one call of diffrax."""
         term, dynamics = self._equations(scene, state, ts, record)
         rows, follows_flow = None, isinstance(self.adjoint, FlowAdjoint)
-        if follows_flow and _torques_act(scene) and ts.shape[0] <= WAY_BACK:
+        if follows_flow and _torques_act(scene) and ts.shape[0] <= MIN_ADJOINT_INTERVALS:
             closed_over = ()
             if may_jump(scene):  # a user's function may close over differentiated arrays
                 program = jax.make_jaxpr(partial(term.vf, args=dynamics))(ts[0], y0)
@@ -427,7 +431,7 @@ class AbstractIntegration(AbstractMethod):
         steps, status = _outcome(solution, y0[0][0].shape)
         return Solution(samples, end_state, steps, status, error)
 
-    def _samples(self, scene, solution: Solution, times, sound, record: Record) -> Samples:
+    def _samples(self, scene, solution: Solution, times, is_regular, record: Record) -> Samples:
         """Attitudes, rates and status from a solution; ``times`` of the samples (T,) or (N, T)."""
         samples, end_state = (_lanes_first(y) for y in (solution.samples, solution.end_state))
         dynamics = scene.dynamics
@@ -438,20 +442,20 @@ class AbstractIntegration(AbstractMethod):
             motors = _of_wheels(dynamics.wheels, powers) if powers else None
         if dynamics.coupled:
             spins = jnp.stack(samples[2], axis=-1)
-        later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+        scene_over_time = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
         times = jnp.atleast_2d(times)
         # diffrax fills the times that were not reached with inf
         reached = jnp.isfinite(sum(jax.tree.leaves(samples)))
-        wxyz, omega, _ = self.chart.finish(later, tuple(samples), times)
-        *_, sound_at_end = self.chart.finish(later, tuple(end_state), times[:, -1:])
-        is_known = sound[:, None, None] & reached[..., None]
+        wxyz, omega, _ = self.chart.finish(scene_over_time, tuple(samples), times)
+        *_, is_regular_at_end = self.chart.finish(scene_over_time, tuple(end_state), times[:, -1:])
+        is_known = is_regular[:, None, None] & reached[..., None]
         wxyz, omega = (where_lost(x, is_known & jnp.isfinite(x)) for x in (wxyz, omega))
         outcome = solution.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
         is_successful = outcome == Status.SUCCESSFUL
         status = jnp.where(is_successful & ~finite, Status.NOT_FINITE, outcome)
-        is_singular = ~sound | (~sound_at_end[:, -1] & ~is_successful)
+        is_singular = ~is_regular | (~is_regular_at_end[:, -1] & ~is_successful)
         if self.chart.canonical:  # steps become too short where the Euler angles are singular
             is_singular = is_singular | (outcome == Status.STEP_FAILED)
         return Samples(
@@ -491,8 +495,8 @@ def _outcome(solution, shape) -> tuple[StepCounts, Array]:
         return StepCounts.of(*counts), jnp.array(_OF_MIDPOINT)[progress.reason]
     limit = solution.result == diffrax.RESULTS.max_steps_reached
     status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
-    good = solution.result == diffrax.RESULTS.successful
-    status = jnp.where(good, Status.SUCCESSFUL, status)
+    is_successful = solution.result == diffrax.RESULTS.successful
+    status = jnp.where(is_successful, Status.SUCCESSFUL, status)
     accepted, rejected = (
         jnp.broadcast_to(solution.stats[f"num_{name}_steps"], shape)
         for name in ("accepted", "rejected")
@@ -500,7 +504,7 @@ def _outcome(solution, shape) -> tuple[StepCounts, Array]:
     return StepCounts.of(accepted, rejected), jnp.broadcast_to(status, shape)
 
 
-# in the order of the outcomes of ``_turn.py``
+# in the order of the outcomes of ``_iteration.py``
 _OF_LOOP = (
     Status.SUCCESSFUL,
     Status.SUCCESSFUL,

@@ -3,7 +3,7 @@
 ``max``, ``clip``, ``where``, comparisons, ``floor``, ... of values that vary with the state or the
 time are the *switches* of a field. Each has a *level*: the side of a comparison, or the integer of
 a ``floor``. With all levels fixed the field is smooth. The *margin* of a switch is positive as long
-as its level is correct, and falls through zero where the switch turns. A step is therefore
+as its level is correct, and falls through zero where the switch flips. A step is therefore
 integrated with fixed levels, and ends where the first margin vanishes.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
-from polhode._kernels import SMOOTH, without_derivatives
+from polhode._kernels import SMOOTH, binder, subjaxprs, without_derivatives
 
 _CALLS = frozenset(
     "jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat2 checkpoint".split()  # noqa: SIM905
@@ -35,7 +35,7 @@ _OPAQUE = _NOT_DIFFERENTIABLE | frozenset(
     "bitcast_convert_type nextafter approx_top_k reduce reduce_window reduce_window_max"  # noqa: SIM905
     " reduce_window_min select_and_gather_add scatter-max scatter-min".split()
 )
-"""Operations whose switches cannot be located: ``Switched.hidden_operations`` lists them."""
+"""Operations whose switches cannot be located: ``SwitchedProgram.hidden_operations`` lists them."""
 
 _CONSTANT = frozenset(("eq", "ne", "is_finite"))
 """Comparisons that change at isolated points of a motion only, or in one that has failed: they are
@@ -51,7 +51,7 @@ _SORTED = 16
 """Largest number of values that are sorted by pairwise comparisons."""
 
 
-class Switched(NamedTuple):
+class SwitchedProgram(NamedTuple):
     """A program and its K switches.
 
     - ``frozen(levels, *args)``: the results with fixed levels (K,), the margins (K,), and the level
@@ -78,40 +78,43 @@ STATE, TIME = 1, 2
 """What a value varies with: the state, the time, both (3) or neither (0)."""
 
 
-def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Switched:
+def switches_of(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> SwitchedProgram:
     """The switches of a program; ``varies``: for each of its arguments ``STATE``, ``TIME`` or 0."""
 
-    def run(args, chooser):
-        walk = _Walk(chooser)
-        outputs = walk.jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, list(zip(args, varies)))
-        return [x for x, _ in outputs], walk
+    def run(args, level_source):
+        interpreter = _Interpreter(level_source)
+        outputs = interpreter.jaxpr(
+            closed_jaxpr.jaxpr, closed_jaxpr.consts, list(zip(args, varies))
+        )
+        return [x for x, _ in outputs], interpreter
 
     def frozen(levels, *args):
-        chooser = _Held(levels)
-        out, _ = run(args, chooser)
-        return out, *chooser.collect(dtype)
+        level_source = _FixedLevels(levels)
+        out, _ = run(args, level_source)
+        return out, *level_source.collect(dtype)
 
     def levels(*args):
-        chooser = _Free(dtype)
-        run(args, chooser)
-        return chooser.collect()
+        level_source = _ComputedLevels(dtype)
+        run(args, level_source)
+        return level_source.collect()
 
     jumps: list[bool] = []
     timed: list[bool] = []
     hidden_operations: list[str] = []
 
-    def note(*args):
-        chooser = _Free(dtype)
-        _, walk = run(args, chooser)
-        jumps.extend(chooser.jumps)
-        timed.extend(walk.timed)
-        hidden_operations.extend(walk.hidden_operations)
-        return chooser.collect()
+    def collect_properties(*args):
+        level_source = _ComputedLevels(dtype)
+        _, interpreter = run(args, level_source)
+        jumps.extend(level_source.jumps)
+        timed.extend(interpreter.timed)
+        hidden_operations.extend(interpreter.hidden_operations)
+        return level_source.collect()
 
     jax.eval_shape(
-        note, *(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in closed_jaxpr.jaxpr.invars)
+        collect_properties,
+        *(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in closed_jaxpr.jaxpr.invars),
     )
-    return Switched(
+    return SwitchedProgram(
         frozen,
         levels,
         np.array(jumps, bool),
@@ -120,7 +123,7 @@ def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Sw
     )
 
 
-def guarded(results: Any, hidden: tuple[str, ...]) -> Any:
+def raising_on_hidden_switches(results: Any, hidden: tuple[str, ...]) -> Any:
     """``results``, whose derivatives raise NotImplementedError if they would omit jumps inside the
     ``hidden`` operations. Operations that JAX itself refuses to differentiate are not named."""
     named = ", ".join(name for name in hidden if name not in _NOT_DIFFERENTIABLE)
@@ -136,7 +139,7 @@ def guarded(results: Any, hidden: tuple[str, ...]) -> Any:
 
 class _Rule(NamedTuple):
     """Functions of the argument u of a switch: its ``level(u)``, its ``margin(u, level)``, and
-    ``new_level(u, level)``, the level after it turns."""
+    ``new_level(u, level)``, the level after it flips."""
 
     level: Callable[[Any], Any]
     margin: Callable[[Any, Any], Any]
@@ -164,18 +167,19 @@ _TRUNC = _Rule(
 )
 
 
-# The jaxpr is interpreted with fixed levels (`_Held`), or to compute the levels (`_Free`). A level
-# is identified only by the order in which the interpreter reaches its switch, so this order must
-# not depend on values: loops are unrolled, and all branches of a `cond` are evaluated.
+# The jaxpr is interpreted with fixed levels (`_FixedLevels`), or to compute the levels
+# (`_ComputedLevels`). A level is identified only by the order in which the interpreter reaches its
+# switch, so this order must not depend on values: loops are unrolled, and all branches of a `cond`
+# are evaluated.
 
 
-class _Held:
+class _FixedLevels:
     """Returns fixed levels one after another, and collects the margins."""
 
     def __init__(self, levels):
         self.levels, self.place, self.margins, self.new_levels = levels, 0, [], []
 
-    def choose(self, u, rule: _Rule, jumps: bool):
+    def level_of(self, u, rule: _Rule, jumps: bool):
         # The margin has the derivatives of u (up to its sign), because the time of the switch is
         # differentiated through it; a normalised margin would add derivatives of its scale.
         u = jnp.asarray(u)
@@ -193,13 +197,13 @@ class _Held:
         )
 
 
-class _Free:
+class _ComputedLevels:
     """Computes every level from its argument, and collects the levels."""
 
     def __init__(self, dtype):
         self.dtype, self.levels, self.jumps = dtype, [], []
 
-    def choose(self, u, rule: _Rule, jumps: bool):
+    def level_of(self, u, rule: _Rule, jumps: bool):
         u = jnp.asarray(u)
         level = rule.level(u).astype(self.dtype)
         self.levels.append(level.reshape(-1))
@@ -222,22 +226,15 @@ def _may_switch(jaxpr) -> bool:
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
-        if any(_may_switch(subjaxpr) for subjaxpr in _subjaxprs(eqn)):
+        if any(_may_switch(subjaxpr) for subjaxpr in subjaxprs(eqn)):
             return True
     return False
-
-
-def _subjaxprs(eqn):
-    for value in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda v: hasattr(v, "eqns")):
-        subjaxpr = getattr(value, "jaxpr", value)
-        if hasattr(subjaxpr, "eqns"):
-            yield subjaxpr
 
 
 def _calls_back(jaxpr) -> bool:
     """Whether a program calls functions outside of JAX, which may raise or print."""
     return any(
-        eqn.effects or "callback" in eqn.primitive.name or any(map(_calls_back, _subjaxprs(eqn)))
+        eqn.effects or "callback" in eqn.primitive.name or any(map(_calls_back, subjaxprs(eqn)))
         for eqn in jaxpr.eqns
     )
 
@@ -254,7 +251,7 @@ def _is_step(eqn) -> bool:
     # conversions to integers are handled in ``_switch``, and one to bool is equivalent to ``ne``
     if name == "convert_element_type" or name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED:
         return False
-    return any(map(_is_float, eqn.invars)) and not any(True for _ in _subjaxprs(eqn))
+    return any(map(_is_float, eqn.invars)) and not any(True for _ in subjaxprs(eqn))
 
 
 def _to_integer(eqn) -> bool:
@@ -265,13 +262,13 @@ def _is_integer(dtype) -> bool:
     return jnp.issubdtype(dtype, jnp.integer)
 
 
-class _Walk:
+class _Interpreter:
     """An interpreter of jaxprs; values are pairs of an array and what it varies with."""
 
-    def __init__(self, chooser):
-        self.chooser, self.hidden_operations = chooser, []
-        # ``moves``: what the current operation varies with; ``timed``: for each switch
-        self.moves, self.timed = 0, []
+    def __init__(self, level_source):
+        self.level_source, self.hidden_operations = level_source, []
+        # ``variation``: what the current operation varies with; ``timed``: for each switch
+        self.variation, self.timed = 0, []
 
     def jaxpr(self, jaxpr, consts, args):
         env: dict[Any, Any] = {v: (c, 0) for v, c in zip(jaxpr.constvars, consts)}
@@ -284,45 +281,45 @@ class _Walk:
             env.update(zip(eqn.outvars, self.equation(eqn, [read(v) for v in eqn.invars])))
         return [read(v) for v in jaxpr.outvars]
 
-    def side(self, u, jumps: bool = False, rule: _Rule = _SIDE):
+    def is_nonnegative(self, u, jumps: bool = False, rule: _Rule = _SIDE):
         """A switch: whether ``u`` is not negative, constant within a step."""
-        return self.choose(u, rule, jumps) > 0
+        return self.level_of(u, rule, jumps) > 0
 
-    def choose(self, u, rule: _Rule, jumps: bool):
-        self.timed.extend([self.moves == TIME] * jnp.size(u))
-        return self.chooser.choose(u, rule, jumps)
+    def level_of(self, u, rule: _Rule, jumps: bool):
+        self.timed.extend([self.variation == TIME] * jnp.size(u))
+        return self.level_source.level_of(u, rule, jumps)
 
     def equation(self, eqn, operands):
         name, x = eqn.primitive.name, [value for value, _ in operands]
-        self.moves = moves = reduce(or_, (m for _, m in operands), 0)
-        if moves and name in _CALLS and eqn.params.get("name") != SMOOTH:
-            for subjaxpr in _subjaxprs(eqn):
+        self.variation = variation = reduce(or_, (m for _, m in operands), 0)
+        if variation and name in _CALLS and eqn.params.get("name") != SMOOTH:
+            for subjaxpr in subjaxprs(eqn):
                 if _may_switch(subjaxpr):
                     return self._call(eqn, operands)
-        if moves and name == "scan" and any(map(_may_switch, _subjaxprs(eqn))):
+        if variation and name == "scan" and any(map(_may_switch, subjaxprs(eqn))):
             return self._scan(eqn, operands)
-        branches = list(_subjaxprs(eqn)) if moves and name == "cond" else []
+        branches = list(subjaxprs(eqn)) if variation and name == "cond" else []
         # a check (``eqx.error_if``) must be evaluated in its own branch only
         if any(map(_may_switch, branches)) and not any(map(_calls_back, branches)):
             return self._cond(eqn, operands)
-        if moves and name == _COMPOSED:
+        if variation and name == _COMPOSED:
             return self._expanded(eqn, operands)
         if (
-            moves
+            variation
             and name in _OPAQUE
-            and (name != "while" or any(map(_may_switch, _subjaxprs(eqn))))
+            and (name != "while" or any(map(_may_switch, subjaxprs(eqn))))
         ):
             self.hidden_operations.append(name)
         first_var = next((v for v in eqn.invars if not isinstance(v, Literal)), None)
-        if moves and eqn.outvars and first_var is not None and _is_float(first_var):
+        if variation and eqn.outvars and first_var is not None and _is_float(first_var):
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
-                return [(o, moves if m else 0) for o, m in outputs]
-        if moves and _is_step(eqn):
+                return [(o, variation if m else 0) for o, m in outputs]
+        if variation and _is_step(eqn):
             self.hidden_operations.append(name)
         out = _bind(eqn, x)
         is_constant = name in _CONSTANT
-        return [(o, 0 if is_constant else moves) for o in out]
+        return [(o, 0 if is_constant else variation) for o in out]
 
     def _switch(self, eqn, name, x):
         out = eqn.outvars[0].aval
@@ -330,22 +327,22 @@ class _Walk:
             a, b = (jnp.broadcast_to(jnp.asarray(v, out.dtype), out.shape) for v in x)
             return [(self._select_larger(a, b, name == "max"), True)]
         if name == "abs":
-            return [(jnp.where(self.side(x[0]), x[0], -x[0]), True)]
+            return [(jnp.where(self.is_nonnegative(x[0]), x[0], -x[0]), True)]
         # The second entry: whether the result varies while the levels are fixed. The result of a
         # comparison does not, so that values computed from it alone (a table index, a mask) have no
         # switches.
         if name == "sign":
             one = jnp.ones((), out.dtype)
-            return [(jnp.where(self.side(x[0], True), one, -one), False)]
+            return [(jnp.where(self.is_nonnegative(x[0], True), one, -one), False)]
         if name == "clamp":
-            low, middle, high = (jnp.broadcast_to(jnp.asarray(v, out.dtype), out.shape) for v in x)
+            low, operand, high = (jnp.broadcast_to(jnp.asarray(v, out.dtype), out.shape) for v in x)
             return [
-                (self._select_larger(low, self._select_larger(middle, high, False), True), True)
+                (self._select_larger(low, self._select_larger(operand, high, False), True), True)
             ]
         if name in _ORDERED:
             a, b = jnp.asarray(x[0]), jnp.asarray(x[1])
             rule = _ABOVE if name in ("gt", "lt", "lt_to") else _SIDE
-            above = self.side(a - b if name in ("gt", "ge") else b - a, True, rule)
+            above = self.is_nonnegative(a - b if name in ("gt", "ge") else b - a, True, rule)
             return [(jnp.broadcast_to(above, out.shape), False)]
         if name == "floor":
             return [(self._integer_level(x[0], _FLOOR, out), False)]
@@ -364,11 +361,11 @@ class _Walk:
         # smoothly, and the jump becomes a switch.
         if name == "atan2":
             y, x = x
-            is_upper, around = self.side(y, True), jnp.asarray(2 * np.pi, out.dtype)
-            turn = jnp.where(
-                is_upper & (y < 0), around, jnp.where(~is_upper & (y >= 0), -around, 0)
+            is_upper, two_pi = self.is_nonnegative(y, True), jnp.asarray(2 * np.pi, out.dtype)
+            branch_jump = jnp.where(
+                is_upper & (y < 0), two_pi, jnp.where(~is_upper & (y >= 0), -two_pi, 0)
             )
-            return [(jnp.arctan2(y, x) + jnp.where(x < 0, turn, 0), True)]
+            return [(jnp.arctan2(y, x) + jnp.where(x < 0, branch_jump, 0), True)]
         if name in ("reduce_max", "reduce_min"):
             value, _ = self._extreme(x[0], eqn.params["axes"], name == "reduce_max")
             return [(value, True)]
@@ -408,10 +405,10 @@ class _Walk:
 
     def _select_larger(self, a, b, larger: bool):
         """The larger (or the smaller) of two."""
-        return jnp.where(self.side(a - b if larger else b - a), a, b)
+        return jnp.where(self.is_nonnegative(a - b if larger else b - a), a, b)
 
     def _integer_level(self, u, rule, out):
-        level = self.choose(jnp.broadcast_to(u, out.shape), rule, True)
+        level = self.level_of(jnp.broadcast_to(u, out.shape), rule, True)
         return level.astype(out.dtype)
 
     def _extreme(self, x, axes, larger: bool, jumps: bool = False):
@@ -425,7 +422,7 @@ class _Walk:
         # as a chain, but log n iterations of this loop, so that the program grows with log n only.
         while rows.shape[0] > 1:
             even = rows.shape[0] // 2 * 2
-            is_first = self.side(
+            is_first = self.is_nonnegative(
                 rows[:even:2] - rows[1:even:2] if larger else rows[1:even:2] - rows[:even:2], jumps
             )
             rows, places = (
@@ -438,13 +435,15 @@ class _Walk:
         """Columns (n, ...) sorted by the first one in ascending order: the new index of a number is
         the number of others that come before it."""
         keys, jumps = columns[0], len(columns) > 1
-        place = jnp.zeros(keys.shape, jnp.int32)
+        position = jnp.zeros(keys.shape, jnp.int32)
         for distance in range(1, len(keys)):
-            in_order = self.side(keys[distance:] - keys[:-distance], jumps).astype(jnp.int32)
-            place = place.at[distance:].add(in_order).at[:-distance].add(1 - in_order)
-        order = jnp.arange(len(keys), dtype=place.dtype).reshape(-1, *[1] * keys.ndim)
+            in_order = self.is_nonnegative(keys[distance:] - keys[:-distance], jumps).astype(
+                jnp.int32
+            )
+            position = position.at[distance:].add(in_order).at[:-distance].add(1 - in_order)
+        order = jnp.arange(len(keys), dtype=position.dtype).reshape(-1, *[1] * keys.ndim)
         return [
-            jnp.sum(jnp.where(place[None] == order, x[None], 0), axis=1, dtype=x.dtype)
+            jnp.sum(jnp.where(position[None] == order, x[None], 0), axis=1, dtype=x.dtype)
             for x in columns
         ]
 
@@ -468,7 +467,7 @@ class _Walk:
 
     def _cond(self, eqn, operands):
         """All branches are evaluated, and the index selects the results of one."""
-        (index, moves), branch_operands = operands[0], operands[1:]
+        (index, variation), branch_operands = operands[0], operands[1:]
         branches = [self.jaxpr(b.jaxpr, b.consts, branch_operands) for b in eqn.params["branches"]]
         index = jnp.clip(jnp.asarray(index, jnp.int32), 0, len(branches) - 1)
         out = []
@@ -476,7 +475,7 @@ class _Walk:
             value = values[0][0]
             for k, (branch_value, _) in enumerate(values[1:], 1):
                 value = jnp.where(index == k, branch_value, value)
-            out.append((value, reduce(or_, (m for _, m in values), moves)))
+            out.append((value, reduce(or_, (m for _, m in values), variation)))
         return out
 
     def _scan(self, eqn, operands):
@@ -509,9 +508,5 @@ class _Walk:
 
 
 def _bind(eqn, x) -> Sequence[Any]:
-    bind_params = eqn.primitive.get_bind_params(eqn.params)
-    funs, params = (
-        bind_params if isinstance(bind_params, tuple) else ((), bind_params)
-    )  # older versions of JAX return functions too
-    out = eqn.primitive.bind(*funs, *x, **params)
+    out = binder(eqn)(*x)
     return out if eqn.primitive.multiple_results else [out]

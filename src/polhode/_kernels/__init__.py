@@ -7,18 +7,18 @@ its gain; ``polhode._policy`` contains their thresholds and the switch that turn
 from polhode._kernels._calls import Distinct as Distinct, jit_distinct as jit_distinct
 from polhode._kernels._derivatives import (
     SMOOTH as SMOOTH,
-    along_slopes as along_slopes,
     are_close as are_close,
-    attached as attached,
-    attached_to as attached_to,
     derivable_once as derivable_once,
     is_differentiated as is_differentiated,
-    is_slope as is_slope,
+    is_nonzero_tangent as is_nonzero_tangent,
+    jvp_of_nonzero as jvp_of_nonzero,
     linear as linear,
     over_gap as over_gap,
     smooth as smooth,
     spread as spread,
     underivable as underivable,
+    with_derivative_rule as with_derivative_rule,
+    with_derivatives_of as with_derivatives_of,
     without_derivatives as without_derivatives,
     zeros as zeros,
 )
@@ -32,10 +32,16 @@ from polhode._kernels._fold import (
 from polhode._kernels._fused import (
     any_of as any_of,
     formula as formula,
-    is_holdable as is_holdable,
+    is_fusible as is_fusible,
     kernel as kernel,
     map_chunks as map_chunks,
-    most_of as most_of,
+    max_over_batch as max_over_batch,
     put as put,
 )
 from polhode._kernels._precision import in_double as in_double
+from polhode._kernels._programs import (
+    binder as binder,
+    constants_as_operands as constants_as_operands,
+    dependent_results as dependent_results,
+    subjaxprs as subjaxprs,
+)

@@ -68,14 +68,14 @@ _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
 @jax.tree_util.register_static
-class _Constant:
+class _StaticResult:
     """A static value returned by a compiled program, which JAX stores in the output's tree."""
 
     def __init__(self, value: Any):
         self.value = value
 
     def __eq__(self, other: Any) -> bool:
-        return isinstance(other, _Constant) and self.value == other.value
+        return isinstance(other, _StaticResult) and self.value == other.value
 
     def __hash__(self) -> int:
         return hash(self.value)
@@ -93,7 +93,7 @@ def jit_distinct(fn: Callable) -> Callable:
     def program(static: _Static, arrays: list[Any]):
         args, kwargs = static.with_arrays(arrays)
         static, results = _split(fn(*args, **kwargs))
-        return _Constant(static), results
+        return _StaticResult(static), results
 
     @functools.wraps(fn)
     def call(*args, **kwargs):

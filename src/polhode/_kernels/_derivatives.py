@@ -1,9 +1,9 @@
 """Derivative rules that JAX does not provide.
 
 Two primitives: ``linear``, a linear map with a separate program for its transpose, as in
-``spread``; and ``attached``, which attaches a derivative rule to values computed elsewhere. Also
-values whose derivatives are not known, so that derivatives are NaN or raise an error, and functions
-that are smooth although they contain comparisons.
+``spread``; and ``with_derivative_rule``, which attaches a derivative rule to values computed
+elsewhere. Also values whose derivatives are not known, so that derivatives are NaN or raise an
+error, and functions that are smooth although they contain comparisons.
 """
 
 import functools
@@ -92,7 +92,7 @@ def _jvp(arrays, tangents, *, count, **params):
     if not all(isinstance(x, ad.Zero) for x in operand_tangents):
         operand_tangents = [zeros(x) if isinstance(x, ad.Zero) else x for x in operand_tangents]
         changes = _linear_p.bind(*constants, *operand_tangents, count=count, **params)
-    if any(is_slope(x) for x in tangents[:count]):
+    if any(is_nonzero_tangent(x) for x in tangents[:count]):
         constant_changes = _by_constants(constants, operands, tangents[:count], out, **params)
         changes = (
             [a + b for a, b in zip(changes, constant_changes)] if changes else constant_changes
@@ -103,15 +103,15 @@ def _jvp(arrays, tangents, *, count, **params):
 def _by_constants(constants, operands, tangents, out, *, forward, reverse_error, **_):
     """Tangents of the map along the tangents of its constants."""
     if not reverse_error:
-        return along_slopes(lambda inputs: forward(inputs, operands), constants, tangents)
-    at = [i for i, x in enumerate(tangents) if is_slope(x)]
+        return jvp_of_nonzero(lambda inputs: forward(inputs, operands), constants, tangents)
+    at = [i for i, x in enumerate(tangents) if is_nonzero_tangent(x)]
     size = len(constants)
 
-    def changes(arrays, slopes):
+    def changes(arrays, constant_tangents):
         all_tangents = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in arrays[:size]]
-        for i, x in zip(at, slopes):
+        for i, x in zip(at, constant_tangents):
             all_tangents[i] = x
-        return along_slopes(
+        return jvp_of_nonzero(
             lambda inputs: forward(inputs, arrays[size:]), arrays[:size], all_tangents
         )
 
@@ -120,7 +120,7 @@ def _by_constants(constants, operands, tangents, out, *, forward, reverse_error,
     )
 
 
-def is_slope(x: Any) -> bool:
+def is_nonzero_tangent(x: Any) -> bool:
     """Whether a tangent is an array of floats: neither a symbolic zero nor that of an integer."""
     return not isinstance(x, ad.Zero) and x.dtype != jax.dtypes.float0
 
@@ -130,23 +130,25 @@ def zeros(x: Any) -> Any:
     return jnp.zeros(x.aval.shape, x.aval.dtype)
 
 
-def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled, reverse_error):
+def _transpose(cotangents, *arrays, forward, backward, count, shapes, compiled, reverse_error):
     if backward is None:
         raise NotImplementedError(reverse_error)
     constants, operands = arrays[:count], arrays[count:]
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
-    slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
+    cotangents = [zeros(x) if isinstance(x, ad.Zero) else x for x in cotangents]
     # the same primitive with both programs exchanged: its transpose is the map itself again
-    cotangents = linear(backward, forward, constants, slopes, avals, compiled, reverse_error)
-    return [None] * count + [x if u else None for u, x in zip(unknown, cotangents)]
+    operand_cotangents = linear(
+        backward, forward, constants, cotangents, avals, compiled, reverse_error
+    )
+    return [None] * count + [x if u else None for u, x in zip(unknown, operand_cotangents)]
 
 
 def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, reverse_error):
     # All operands get the axis, batched or not, because the transpose has to return cotangents of
     # the same shapes. The constants have no cotangents here; only batched ones have the axis.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
-    given_dims, operands = dims[:count], []
+    constant_dims, operands = dims[:count], []
     for x, d in zip(arrays[count:], dims[count:]):
         batched_operand = (
             jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
@@ -156,7 +158,7 @@ def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, reverse_
     def batched(fn):
         return lambda constants, operands: jax.vmap(
             lambda *leaves: list(fn(leaves[: len(constants)], leaves[len(constants) :])),
-            in_axes=(*given_dims, *[0] * len(operands)),
+            in_axes=(*constant_dims, *[0] * len(operands)),
         )(*constants, *operands)
 
     out = _linear_p.bind(
@@ -196,9 +198,9 @@ def spread(values: Any, axis: int, count: int) -> Any:
     def forward(_, arrays):
         return [repeat(x) for x in arrays]
 
-    def backward(_, slopes):
+    def backward(_, cotangents):
         def row(i):
-            return [jax.lax.dynamic_index_in_dim(x, i, axis % x.ndim, False) for x in slopes]
+            return [jax.lax.dynamic_index_in_dim(x, i, axis % x.ndim, False) for x in cotangents]
 
         def add(i, total):
             return [a + b for a, b in zip(total, row(i))]
@@ -220,40 +222,40 @@ def spread(values: Any, axis: int, count: int) -> Any:
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
 
 
-def attached(
+def with_derivative_rule(
     rule: Rule,
     operands: Sequence[Any],
     values: Sequence[Any],
-    again: Callable[[Sequence[Any]], tuple[Sequence[Any], Any]] | None = None,
+    recompute: Callable[[Sequence[Any]], tuple[Sequence[Any], Any]] | None = None,
 ) -> list[Any]:
     """``values``, a function of ``operands`` that was computed elsewhere, with a derivative rule.
 
     ``rule(operands, tangents, values)`` returns the tangents of the values, or of the first few
-    values if the others have none. Tangents of operands may be symbolic zeros (``is_slope``). The
-    rule may not close over traced values. It is given the values with this rule attached, so that
-    it can be differentiated again. Loops replace a ``jax.custom_jvp`` by the function itself before
-    second derivatives are taken; this primitive is never replaced.
+    values if the others have none. Tangents of operands may be symbolic zeros
+    (``is_nonzero_tangent``). The rule may not close over traced values. It is given the values with
+    this rule attached, so that it can be differentiated again. Loops replace a ``jax.custom_jvp``
+    by the function itself before second derivatives are taken; this primitive is never replaced.
 
-    ``again(operands)``: if given, a program that computes derivatives computes the values by this
-    function instead. It also returns auxiliary data, which the rule gets as its fourth argument.
+    ``recompute(operands)``: if given, a program that computes derivatives computes the values by
+    this function instead. It also returns auxiliary data, the fourth argument of the rule.
     """
-    return _attached_p.bind(*operands, *values, rule=rule, count=len(operands), again=again)
+    return _attached_p.bind(*operands, *values, rule=rule, count=len(operands), recompute=recompute)
 
 
-def along_slopes(function: Callable, operands: Sequence[Any], tangents: Sequence[Any]) -> Any:
+def jvp_of_nonzero(function: Callable, operands: Sequence[Any], tangents: Sequence[Any]) -> Any:
     """Tangents of ``function(operands)``; ``tangents`` may contain symbolic zeros."""
-    at = [i for i, x in enumerate(tangents) if is_slope(x)]
+    at = [i for i, x in enumerate(tangents) if is_nonzero_tangent(x)]
 
-    def of_sloped(*parameters):
+    def of_active(*parameters):
         inputs = list(operands)
         for i, x in zip(at, parameters):
             inputs[i] = x
         return function(inputs)
 
-    return jax.jvp(of_sloped, [operands[i] for i in at], [tangents[i] for i in at])[1]
+    return jax.jvp(of_active, [operands[i] for i in at], [tangents[i] for i in at])[1]
 
 
-def attached_to(
+def with_derivatives_of(
     function: Callable[..., Sequence[Array]], arguments: Any, values: Sequence[Array]
 ) -> list[Array]:
     """``values`` of ``function(*arguments)``, computed in another way, with the derivatives of
@@ -266,9 +268,9 @@ def attached_to(
         return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, inputs[:size]))(*inputs[size:])
 
     def rule(operands, tangents, values):
-        return along_slopes(of_operands, operands, tangents)
+        return jvp_of_nonzero(of_operands, operands, tangents)
 
-    return attached(rule, [*map(jnp.asarray, closed.consts), *leaves], values)
+    return with_derivative_rule(rule, [*map(jnp.asarray, closed.consts), *leaves], values)
 
 
 _attached_p = Primitive("attached")
@@ -276,29 +278,29 @@ _attached_p.multiple_results = True
 
 
 @_attached_p.def_impl
-def _values(*arrays, rule, count, again):
+def _values(*arrays, rule, count, recompute):
     return list(arrays[count:])
 
 
 @_attached_p.def_abstract_eval
-def _shapes_of_values(*avals, rule, count, again):
+def _shapes_of_values(*avals, rule, count, recompute):
     return list(avals[count:])
 
 
-def _attached_jvp(arrays, tangents, *, rule, count, again):
+def _attached_jvp(arrays, tangents, *, rule, count, recompute):
     # The rule is given ``out``, the values with their derivative rule, so that differentiating the
     # rule gives second derivatives. Tangents of ``values`` are dropped: they are the derivatives of
     # the program that computed the values.
-    operands, values, help_of_rule = arrays[:count], arrays[count:], []
-    is_sloped = any(is_slope(x) for x in tangents[:count])
-    if is_sloped and again is not None:
-        values, *help_of_rule = again(jax.lax.stop_gradient(operands))
-    out = _attached_p.bind(*operands, *values, rule=rule, count=count, again=again)
-    changes = list(rule(operands, tangents[:count], out, *help_of_rule)) if is_sloped else []
+    operands, values, auxiliary_data = arrays[:count], arrays[count:], []
+    has_tangent = any(is_nonzero_tangent(x) for x in tangents[:count])
+    if has_tangent and recompute is not None:
+        values, *auxiliary_data = recompute(jax.lax.stop_gradient(operands))
+    out = _attached_p.bind(*operands, *values, rule=rule, count=count, recompute=recompute)
+    changes = list(rule(operands, tangents[:count], out, *auxiliary_data)) if has_tangent else []
     return out, changes + [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out[len(changes) :]]
 
 
-def _attached_batch(arrays, dims, *, rule, count, again):
+def _attached_batch(arrays, dims, *, rule, count, recompute):
     # Operands common to the batch, such as the weights of a network, are not broadcast; all values
     # get the axis.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
@@ -309,29 +311,29 @@ def _attached_batch(arrays, dims, *, rule, count, again):
         for x, d in zip(arrays[count:], dims[count:])
     ]
 
-    def batched(operands, tangents, values, *help_of_rule):
-        at = [i for i, x in enumerate(tangents) if is_slope(x)]
+    def batched(operands, tangents, values, *auxiliary_data):
+        at = [i for i, x in enumerate(tangents) if is_nonzero_tangent(x)]
 
-        def rule_of_one(operands, present_tangents, values, *help_of_rule):
+        def rule_of_one(operands, present_tangents, values, *auxiliary_data):
             all_tangents = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in operands]
             for i, x in zip(at, present_tangents):
                 all_tangents[i] = x
             return [
                 zeros(x) if isinstance(x, ad.Zero) else x
-                for x in rule(operands, all_tangents, values, *help_of_rule)
+                for x in rule(operands, all_tangents, values, *auxiliary_data)
             ]
 
-        in_axes = axes, [axes[i] for i in at], *[0] * (1 + len(help_of_rule))
+        in_axes = axes, [axes[i] for i in at], *[0] * (1 + len(auxiliary_data))
         return jax.vmap(rule_of_one, in_axes, axis_size=size)(
-            list(operands), [tangents[i] for i in at], list(values), *help_of_rule
+            list(operands), [tangents[i] for i in at], list(values), *auxiliary_data
         )
 
-    def batched_again(operands):
-        assert again is not None
-        return jax.vmap(again, (axes,), axis_size=size)(list(operands))
+    def batched_recompute(operands):
+        assert recompute is not None
+        return jax.vmap(recompute, (axes,), axis_size=size)(list(operands))
 
-    of_batch = None if again is None else batched_again
-    out = _attached_p.bind(*operands, *values, rule=batched, count=count, again=of_batch)
+    of_batch = None if recompute is None else batched_recompute
+    out = _attached_p.bind(*operands, *values, rule=batched, count=count, recompute=of_batch)
     return out, [0] * len(out)
 
 
@@ -361,7 +363,7 @@ def _shape_of_flag(*avals):
 
 def _is_differentiated_jvp(arrays, tangents):
     flag = _is_differentiated_p.bind(*arrays)
-    if any(is_slope(x) for x in tangents):
+    if any(is_nonzero_tangent(x) for x in tangents):
         flag = jnp.ones((), bool)
     return flag, ad.Zero(jax.typeof(flag).to_tangent_aval())
 
@@ -406,18 +408,18 @@ def _nan_tangents(constants: Any, tangents: Any) -> list[Array]:
     return [jnp.where(where & (tangent != 0), np.nan, tangent)]
 
 
-def without_derivatives(tree: Any, why: str) -> Any:
-    """The same arrays, whose derivatives raise NotImplementedError with the message ``why``."""
+def without_derivatives(tree: Any, message: str) -> Any:
+    """The same arrays, whose derivatives raise NotImplementedError with this ``message``."""
 
     @jax.custom_jvp
-    def same(x):
+    def identity(x):
         return x
 
-    @same.defjvp
+    @identity.defjvp
     def rule(primals, tangents):
-        raise NotImplementedError(why)
+        raise NotImplementedError(message)
 
-    return jax.tree.map(lambda x: same(x) if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
+    return jax.tree.map(lambda x: identity(x) if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
 
 
 def are_close(first: Array, second: Array) -> Array:

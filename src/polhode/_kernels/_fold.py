@@ -21,6 +21,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
 
 from polhode import _policy
+from polhode._kernels._programs import binder
 
 # Staging: values that XLA computes once, and not again in every loop that uses them.
 
@@ -127,14 +128,14 @@ _BY_ENTRY = _ELEMENTWISE | frozenset(
 )
 """Operations on arrays of one shape that act on each entry separately."""
 
-_TAKING_APART = frozenset(
+_REARRANGEMENTS = frozenset(
     """broadcast_in_dim convert_element_type copy gather reshape slice split squeeze stop_gradient
     unstack""".split()  # noqa: SIM905
 )
 _CALLS = frozenset(("jit", "pjit", "closed_call"))
 
 
-class _Held(NamedTuple):
+class _Constant(NamedTuple):
     """A value that does not depend on the state: an array, or a number broadcast to an array."""
 
     value: Any
@@ -149,7 +150,7 @@ class _Held(NamedTuple):
         return id(self.value) if self.number is None else ("number", self.number)
 
 
-class _Slot(NamedTuple):
+class _LoopValue(NamedTuple):
     """A value that depends on the state: value number ``index`` of the loop times ``sign``, times
     ``scale`` if there is one.
 
@@ -159,7 +160,7 @@ class _Slot(NamedTuple):
 
     index: int
     aval: Any
-    scale: _Held | None = None
+    scale: _Constant | None = None
     sign: int = 1
     factors: tuple[int, int] | None = None
 
@@ -187,10 +188,10 @@ class Specialised(NamedTuple):
     by_entry: bool
 
 
-class _Step(NamedTuple):
-    """An operation of the loop. ``operands``: for each the number of a loop value or a ``_Held``,
-    its aval, and the shape to which it is broadcast. ``by_entry``: whether it acts on each entry
-    separately."""
+class _LoopOperation(NamedTuple):
+    """An operation of the loop. ``operands``: for each the number of a loop value or a
+    ``_Constant``, its aval, and the shape to which it is broadcast. ``by_entry``: whether it acts
+    on each entry separately."""
 
     outputs: list[int]
     bind: Any
@@ -219,96 +220,106 @@ def specialise(
     jaxpr, _ = partial_eval.dce_jaxpr(
         closed_jaxpr.jaxpr, [True] * len(closed_jaxpr.out_avals), True
     )
-    work = _Work(fold and _policy.is_folded())
-    arguments = [_Held(x) for x in arguments]
-    slots = [work.slot(v.aval) for v in jaxpr.invars[len(arguments) :]]
-    results = work.walk(jaxpr, closed_jaxpr.consts, [*arguments, *slots])
+    evaluator = _PartialEvaluator(fold and _policy.is_folded())
+    arguments = [_Constant(x) for x in arguments]
+    state_values = [evaluator.new_loop_value(v.aval) for v in jaxpr.invars[len(arguments) :]]
+    results = evaluator.evaluate_jaxpr(jaxpr, closed_jaxpr.consts, [*arguments, *state_values])
     avals: list[Any] = [v.aval for v in jaxpr.outvars]
-    out = [(work.operand(x), aval, aval.shape) for x, aval in zip(results, avals)]
-    steps = _steps_of_results(work.steps, out)
+    outputs = [(evaluator.operand(x), aval, aval.shape) for x, aval in zip(results, avals)]
+    operations = _operations_of_results(evaluator.operations, outputs)
     coefficients: dict[int, Any] = {}
     shapes_of: dict[int, set[tuple[int, ...]]] = {}
-    for x, _, shape in (*(o for step in steps for o in step.operands), *out):
-        if isinstance(x, _Held) and x.number is None:
+    for x, _, shape in (*(o for operation in operations for o in operation.operands), *outputs):
+        if isinstance(x, _Constant) and x.number is None:
             coefficients[x.key] = x.value
             shapes_of.setdefault(x.key, set()).add(tuple(shape))
-    for x, *_ in (o for step in steps if not step.by_entry for o in step.operands):
-        if isinstance(x, _Held) and x.number is None:
+    for x, *_ in (
+        o for operation in operations if not operation.by_entry for o in operation.operands
+    ):
+        if isinstance(x, _Constant) and x.number is None:
             shapes_of[x.key].add(MIXED)
-    places = {key: place for place, key in enumerate(coefficients)}
+    positions = {key: position for position, key in enumerate(coefficients)}
     # If every operation acts on each entry separately, and every array is a number or has the shape
     # of the state, the program traced for one shape can be run for any other.
-    lane = slots[-1].aval.shape
-    by_entry = all(step.by_entry for step in steps)
-    for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
-        by_entry = by_entry and aval.shape == lane
-    by_entry = by_entry and all(np.shape(x) in ((), lane) for x in coefficients.values())
-    shared = _shared(steps, out) if stage and _policy.is_staged() else frozenset()
+    lane_shape = state_values[-1].aval.shape
+    by_entry = all(operation.by_entry for operation in operations)
+    for _, aval, _ in (*(o for operation in operations for o in operation.operands), *outputs):
+        by_entry = by_entry and aval.shape == lane_shape
+    by_entry = by_entry and all(np.shape(x) in ((), lane_shape) for x in coefficients.values())
+    shared = _shared(operations, outputs) if stage and _policy.is_staged() else frozenset()
 
     def run(coefficients, *state):
         values = dict(enumerate(state))
 
         def read(operand):
             x, aval, _ = operand
-            if not isinstance(x, _Held):
+            if not isinstance(x, _Constant):
                 return values[x]
-            value = coefficients[places[x.key]] if x.number is None else x.number
+            value = coefficients[positions[x.key]] if x.number is None else x.number
             shape = jnp.shape(state[-1]) if by_entry else aval.shape
             shape = np.broadcast_shapes(np.shape(value), shape)
             return jnp.broadcast_to(jnp.asarray(value, aval.dtype), shape)
 
-        for step in steps:
-            results = step.bind(*(read(o) for o in step.operands))
+        for operation in operations:
+            results = operation.bind(*(read(o) for o in operation.operands))
             for i, x in zip(
-                step.outputs, results if isinstance(results, list | tuple) else [results]
+                operation.outputs, results if isinstance(results, list | tuple) else [results]
             ):
                 values[i] = staged(x, opaque_ones(x)) if i in shared else x
-        return [read(o) for o in out]
+        return [read(o) for o in outputs]
 
     return Specialised(
         tuple(coefficients.values()), run, tuple(map(frozenset, shapes_of.values())), by_entry
     )
 
 
-def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
-    """The steps on which the results depend, and those with side effects only (prints, checks)."""
-    values = {x for x, *_ in out if not isinstance(x, _Held)}
-    needed_steps = []
-    for step in reversed(steps):
-        if not step.outputs or values.intersection(step.outputs):
-            needed_steps.append(step)
-            values.update(x for x, *_ in step.operands if not isinstance(x, _Held))
-    return tuple(reversed(needed_steps))
+def _operations_of_results(operations: list[_LoopOperation], outputs) -> tuple[_LoopOperation, ...]:
+    """The operations on which the results depend, and those with side effects (prints, checks)."""
+    values = {x for x, *_ in outputs if not isinstance(x, _Constant)}
+    needed_operations = []
+    for operation in reversed(operations):
+        if not operation.outputs or values.intersection(operation.outputs):
+            needed_operations.append(operation)
+            values.update(x for x, *_ in operation.operands if not isinstance(x, _Constant))
+    return tuple(reversed(needed_operations))
 
 
-def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
+def _shared(operations: Sequence[_LoopOperation], outputs) -> frozenset[int]:
     """Values that several results depend on and that take enough operations to be staged."""
     # XLA fuses one loop for each result: a value is repeated for each result that depends on it,
     # not for each operation that uses it. A value is therefore staged only if it has several of
     # both. The work that staging saves is the number of operations between a value and the nearest
-    # staged values before it (``behind``).
-    makers = {i: k for k, step in enumerate(steps) for i in step.outputs}
+    # staged values before it (``repeated_operations``).
+    producers = {i: k for k, operation in enumerate(operations) for i in operation.outputs}
 
-    def of(operands):
-        return {i for i, *_ in operands if not isinstance(i, _Held) and i in makers}
+    def loop_inputs(operands):
+        return {i for i, *_ in operands if not isinstance(i, _Constant) and i in producers}
 
-    users = dict.fromkeys(makers, 0)
-    dependent_results: dict[int, set[int]] = {i: set() for i in makers}
-    for k, operand in enumerate(out):
-        for i in of([operand]):
-            users[i] += 1
+    use_counts = dict.fromkeys(producers, 0)
+    dependent_results: dict[int, set[int]] = {i: set() for i in producers}
+    for k, operand in enumerate(outputs):
+        for i in loop_inputs([operand]):
+            use_counts[i] += 1
             dependent_results[i].add(k)
-    for step in reversed(steps):
-        for i in of(step.operands):
-            users[i] += len(step.outputs)
-            dependent_results[i].update(*(dependent_results[made] for made in step.outputs))
+    for operation in reversed(operations):
+        for i in loop_inputs(operation.operands):
+            use_counts[i] += len(operation.outputs)
+            dependent_results[i].update(
+                *(dependent_results[output] for output in operation.outputs)
+            )
     shared: set[int] = set()
-    behind: dict[int, set[int]] = {}  # operations that a fused loop repeats to compute the value
-    for k, step in enumerate(steps):
-        work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
-        for i in step.outputs:
-            behind[i] = work
-            if min(users[i], len(dependent_results[i])) > 1 and len(work) >= _policy.STAGE_WORK:
+    # for each value the operations that a fused loop repeats to compute it
+    repeated_operations: dict[int, set[int]] = {}
+    for k, operation in enumerate(operations):
+        work = {k}.union(
+            *(repeated_operations[i] for i in loop_inputs(operation.operands) - shared)
+        )
+        for i in operation.outputs:
+            repeated_operations[i] = work
+            if (
+                min(use_counts[i], len(dependent_results[i])) > 1
+                and len(work) >= _policy.STAGE_WORK
+            ):
                 shared.add(i)
     return frozenset(shared)
 
@@ -321,62 +332,64 @@ def _shaped(operation: Any, avals) -> Any:
     return None if operation is None else (operation, *(aval.shape for aval in avals))
 
 
-class _Work:
+class _PartialEvaluator:
     """One pass over a jaxpr: evaluates operations that do not depend on the state, and records the
     others."""
 
     def __init__(self, fold: bool):
         self.fold = fold
-        self.steps: list[_Step] = []
+        self.operations: list[_LoopOperation] = []
         self.count = 0
         self.scaled: dict[Any, int] = {}
         self.results: dict[Any, list[Any]] = {}  # results by operation and inputs
         self.referenced: list[Any] = []  # arrays whose ids are in the keys above
 
-    def slot(self, aval) -> _Slot:
+    def new_loop_value(self, aval) -> _LoopValue:
         self.count += 1
-        return _Slot(self.count - 1, aval)
+        return _LoopValue(self.count - 1, aval)
 
-    def once(self, key, inputs, outs, make: Callable[[], list[Any]]) -> list[Any]:
-        """The result of ``make``, cached by operation and inputs (common subexpressions).
+    def cached(self, key, inputs, outs, compute: Callable[[], list[Any]]) -> list[Any]:
+        """The result of ``compute``, cached by operation and inputs (common subexpressions).
 
         ``key`` identifies the operation and the shapes of its inputs; it is None for an operation
         that cannot be hashed. Arrays that several parts of a scene share, such as an orbit, are
         thereby evaluated once.
         """
         if key is None:
-            return make()
+            return compute()
         # Arrays are compared by identity, as their numbers may be traced. ``referenced`` keeps a
         # reference to each, because the id of a deleted object may be used again.
-        names = (_key_of(x) if isinstance(x, _Held) else x for x in inputs)
+        names = (_key_of(x) if isinstance(x, _Constant) else x for x in inputs)
         key = key, *names, *((aval.shape, aval.dtype) for aval in outs)
         if key not in self.results:
-            self.referenced += [x.value for x in inputs if isinstance(x, _Held)]
-            self.results[key] = make()
+            self.referenced += [x.value for x in inputs if isinstance(x, _Constant)]
+            self.results[key] = compute()
         return self.results[key]
 
-    def emit(self, bind, inputs, avals, outs, key, name="mul") -> list[_Slot]:
+    def emit(self, bind, inputs, avals, outs, key, name="mul") -> list[_LoopValue]:
         shapes = [(outs[0] if name in _ELEMENTWISE else aval).shape for aval in avals]
         operands = [(self.operand(x), aval, s) for x, aval, s in zip(inputs, avals, shapes)]
 
-        def make():
-            slots = [self.slot(aval) for aval in outs]
-            self.steps.append(_Step([s.index for s in slots], bind, name in _BY_ENTRY, operands))
-            return slots
+        def append_operation():
+            loop_values = [self.new_loop_value(aval) for aval in outs]
+            self.operations.append(
+                _LoopOperation([s.index for s in loop_values], bind, name in _BY_ENTRY, operands)
+            )
+            return loop_values
 
-        return self.once(_shaped(key, avals), [x for x, *_ in operands], outs, make)
+        return self.cached(_shaped(key, avals), [x for x, *_ in operands], outs, append_operation)
 
     def operand(self, x) -> Any:
-        """A value as an operand of a step: a ``_Held``, or the number of a value of the loop."""
-        if isinstance(x, _Held):
+        """A value as an operand: a ``_Constant``, or the number of a value of the loop."""
+        if isinstance(x, _Constant):
             self.referenced.append(x.value)
             return x
         index = self.unsigned(x)
         if x.sign > 0:
             return index
-        return self.emit(lax.neg, [_Slot(index, x.aval)], [x.aval], [x.aval], "neg")[0].index
+        return self.emit(lax.neg, [_LoopValue(index, x.aval)], [x.aval], [x.aval], "neg")[0].index
 
-    def unsigned(self, x: _Slot) -> int:
+    def unsigned(self, x: _LoopValue) -> int:
         """The number of a value with its scale, but without its sign."""
         # Scales and signs are multiplied out only when an operation needs the value itself. Until
         # then products of parameters are combined before the loop, and a sign changes a sum to a
@@ -386,47 +399,49 @@ class _Work:
         key = (x.index, x.scale.key)
         if key not in self.scaled:
             self.referenced.append(x.scale.value)
-            a, b = _Slot(x.index, x.aval), x.scale
+            a, b = _LoopValue(x.index, x.aval), x.scale
             if x.factors is not None:  # other products are likely to use the scaled factor as well
-                a, scaled_factor = (_Slot(index, x.aval) for index in x.factors)
-                b = _Slot(self.unsigned(scaled_factor._replace(scale=x.scale)), x.aval)
+                a, scaled_factor = (_LoopValue(index, x.aval) for index in x.factors)
+                b = _LoopValue(self.unsigned(scaled_factor._replace(scale=x.scale)), x.aval)
             self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval], "mul")[0].index
         return self.scaled[key]
 
-    def walk(self, jaxpr, consts, inputs) -> Sequence[_Held | _Slot]:
-        env: dict[Any, Any] = dict(zip(jaxpr.constvars, map(_Held, consts)))
+    def evaluate_jaxpr(self, jaxpr, consts, inputs) -> Sequence[_Constant | _LoopValue]:
+        env: dict[Any, Any] = dict(zip(jaxpr.constvars, map(_Constant, consts)))
         env.update(zip(jaxpr.invars, inputs))
 
         def read(v):
             if not isinstance(v, Literal):
                 return env[v]
-            return _Held(np.asarray(v.val, cast(ShapedArray, v.aval).dtype)[()])
+            return _Constant(np.asarray(v.val, cast(ShapedArray, v.aval).dtype)[()])
 
         for eqn in jaxpr.eqns:
             operands = [read(v) for v in eqn.invars]
-            env.update(zip(eqn.outvars, self.equation(eqn, operands)))
+            env.update(zip(eqn.outvars, self.process_equation(eqn, operands)))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, eqn, operands) -> Sequence[_Held | _Slot]:
+    def process_equation(self, eqn, operands) -> Sequence[_Constant | _LoopValue]:
         name = eqn.primitive.name
         if name in _CALLS:
             inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-            return self.walk(inner.jaxpr, inner.consts, operands)
+            return self.evaluate_jaxpr(inner.jaxpr, inner.consts, operands)
         # Operations with effects, such as checks, stay in the loop.
-        if not eqn.effects and all(isinstance(x, _Held) for x in operands):
+        if not eqn.effects and all(isinstance(x, _Constant) for x in operands):
             numbers = all(x.number is not None for x in operands)
-            if self.fold or numbers or name in _TAKING_APART:
+            if self.fold or numbers or name in _REARRANGEMENTS:
                 avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
                 key = _shaped(_operation(eqn), avals)
-                return self.once(key, operands, outs, lambda: self.evaluate(eqn, operands))
+                return self.cached(
+                    key, operands, outs, lambda: self.evaluate_equation(eqn, operands)
+                )
         elif self.fold and len(eqn.outvars) == 1:
             simple = self.simplify(name, operands, eqn.outvars[0].aval)
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        return self.emit(_binder(eqn), operands, avals, outs, _operation(eqn), name)
+        return self.emit(binder(eqn), operands, avals, outs, _operation(eqn), name)
 
-    def evaluate(self, eqn, operands) -> list[_Held]:
+    def evaluate_equation(self, eqn, operands) -> list[_Constant]:
         """The results of an equation that does not depend on the state, as numbers if possible."""
         name, out = eqn.primitive.name, eqn.outvars[0].aval
         # Only NumPy numbers can be compared with 0 and 1 while tracing, and thereby remove an
@@ -435,101 +450,103 @@ class _Work:
         if operands and single and name == "broadcast_in_dim":
             return operands
         if single and name in _FOLDS and all(x.number is not None for x in operands):
-            return [_Held(out.dtype.type(_FOLDS[name](*(x.number for x in operands))))]
+            return [_Constant(out.dtype.type(_FOLDS[name](*(x.number for x in operands))))]
         if single and name in _ELEMENTWISE and len(eqn.outvars) == 1:
-            return [_Held(_binder(eqn)(*(jnp.asarray(x.value) for x in operands)))]
+            return [_Constant(binder(eqn)(*(jnp.asarray(x.value) for x in operands)))]
         operand_arrays = [
             jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(operands, eqn.invars)
         ]
-        results = _binder(eqn)(*operand_arrays)
-        return [_Held(x) for x in (results if isinstance(results, list | tuple) else [results])]
+        results = binder(eqn)(*operand_arrays)
+        return [_Constant(x) for x in (results if isinstance(results, list | tuple) else [results])]
 
-    def simplify(self, name, operands, aval) -> _Held | _Slot | None:
+    def simplify(self, name, operands, aval) -> _Constant | _LoopValue | None:
         """An operation with a zero or a factor that does not depend on the state, simplified; None
         if it cannot be."""
         if not jnp.issubdtype(aval.dtype, jnp.floating):  # complex numbers have no sign
             return None
-        if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in operands):
+        if any(isinstance(x, _LoopValue) and x.aval.shape != aval.shape for x in operands):
             return None  # a scalar that depends on the state is broadcast to an array
         if name == "neg":
-            return self.times(operands[0], _Held(aval.dtype.type(-1)), aval)
+            return self.times(operands[0], _Constant(aval.dtype.type(-1)), aval)
         if name in ("add", "add_any", "sub"):
             a, b = operands
             if name == "sub":
-                b = self.times(b, _Held(aval.dtype.type(-1)), aval)
+                b = self.times(b, _Constant(aval.dtype.type(-1)), aval)
             return self.sum(a, b, aval)
         if name == "mul":
             a, b = operands
-            if isinstance(a, _Held):
+            if isinstance(a, _Constant):
                 a, b = b, a
-            return self.times(a, b, aval) if isinstance(b, _Held) else self.product(a, b, aval)
-        if name == "div" and isinstance(operands[1], _Held) and operands[1].number is not None:
+            return self.times(a, b, aval) if isinstance(b, _Constant) else self.product(a, b, aval)
+        if name == "div" and isinstance(operands[1], _Constant) and operands[1].number is not None:
             # The reciprocal of a power of two is exact. With any other reciprocal the product has
             # one rounding error more than the quotient.
             mantissa, _ = np.frexp(operands[1].number)
             if abs(mantissa) == 0.5:
-                return self.times(operands[0], _Held(aval.dtype.type(1 / operands[1].number)), aval)
+                return self.times(
+                    operands[0], _Constant(aval.dtype.type(1 / operands[1].number)), aval
+                )
         return None
 
-    def sum(self, a, b, aval) -> _Held | _Slot:
+    def sum(self, a, b, aval) -> _Constant | _LoopValue:
         """The sum of two values, of which at least one depends on the state."""
-        if isinstance(a, _Held):
+        if isinstance(a, _Constant):
             a, b = b, a
-        if isinstance(b, _Held):
+        if isinstance(b, _Constant):
             if b.number == 0:
                 return a
-            unsigned_slot = _Slot(self.unsigned(a), aval)
+            unsigned_slot = _LoopValue(self.unsigned(a), aval)
             if a.sign > 0:
                 return self.emit(lax.add, [unsigned_slot, b], [aval] * 2, [aval], "add")[0]
             return self.emit(lax.sub, [b, unsigned_slot], [aval] * 2, [aval], "sub")[0]
         if a.index == b.index:  # p x + q x = (p + q) x, with the sum taken before the loop
-            p, q = (_Held(aval.dtype.type(1)) if x.scale is None else x.scale for x in (a, b))
+            p, q = (_Constant(aval.dtype.type(1)) if x.scale is None else x.scale for x in (a, b))
             scale = self.combine("add" if a.sign == b.sign else "sub", p, q, aval)
-            return self.times(_Slot(a.index, a.aval, None, a.sign), scale, aval)
+            return self.times(_LoopValue(a.index, a.aval, None, a.sign), scale, aval)
         key = [None if x.scale is None else x.scale.key for x in (a, b)]
         if key[0] == key[1]:  # one multiplication for both
-            scale, parts = a.scale, [_Slot(x.index, aval) for x in (a, b)]
+            scale, parts = a.scale, [_LoopValue(x.index, aval) for x in (a, b)]
         else:
-            scale, parts = None, [_Slot(self.unsigned(x), aval) for x in (a, b)]
+            scale, parts = None, [_LoopValue(self.unsigned(x), aval) for x in (a, b)]
         name, bind = ("add", lax.add) if a.sign == b.sign else ("sub", lax.sub)
         (total,) = self.emit(bind, parts, [aval] * 2, [aval], name)
         return total._replace(scale=scale, sign=a.sign)
 
-    def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
+    def product(self, a: _LoopValue, b: _LoopValue, aval) -> _Constant | _LoopValue:
         """The product of two values that depend on the state; it takes over their scales."""
         # sorted, so that x y and y x are one product
-        unscaled = [_Slot(index, aval) for index in sorted((a.index, b.index))]
+        unscaled = [_LoopValue(index, aval) for index in sorted((a.index, b.index))]
         (result,) = self.emit(lax.mul, unscaled, [aval] * 2, [aval], "mul")
         product: Any = result._replace(sign=a.sign * b.sign)
         for x in (a, b):
             if x.scale is not None:
                 product = self.times(product, x.scale, aval)
-        if isinstance(product, _Slot) and (a.scale is None) != (b.scale is None):
+        if isinstance(product, _LoopValue) and (a.scale is None) != (b.scale is None):
             factors = (a.index, b.index) if a.scale is None else (b.index, a.index)
             product = product._replace(factors=factors)
         return product
 
-    def combine(self, name: str, a: _Held, b: _Held, aval) -> _Held:
+    def combine(self, name: str, a: _Constant, b: _Constant, aval) -> _Constant:
         """Sum, difference or product of two values that do not depend on the state (cached)."""
         if a.number is not None and b.number is not None:
-            return _Held(aval.dtype.type(_FOLDS[name](a.number, b.number)))
+            return _Constant(aval.dtype.type(_FOLDS[name](a.number, b.number)))
 
-        def make():
+        def compute():
             first, second = (jnp.asarray(x.value, aval.dtype) for x in (a, b))
-            return [_Held(getattr(jnp, _WORDS[name])(first, second))]
+            return [_Constant(getattr(jnp, _NUMPY_NAMES[name])(first, second))]
 
-        return self.once(("combined", name), [a, b], [aval], make)[0]
+        return self.cached(("combined", name), [a, b], [aval], compute)[0]
 
-    def times(self, x, factor: _Held, aval) -> _Held | _Slot:
+    def times(self, x, factor: _Constant, aval) -> _Constant | _LoopValue:
         """``x`` times a factor that does not depend on the state, stored as a scale and a sign."""
-        if isinstance(x, _Held):
+        if isinstance(x, _Constant):
             return self.combine("mul", x, factor, aval)
         number = factor.number
         if number is not None:
             if number == 0:  # zero even if x is not finite: the term is absent
                 return factor
             if number < 0:
-                x, factor = x._replace(sign=-x.sign), _Held(aval.dtype.type(-number))
+                x, factor = x._replace(sign=-x.sign), _Constant(aval.dtype.type(-number))
             if abs(number) == 1:
                 return x
         if x.scale is not None:
@@ -537,10 +554,10 @@ class _Work:
         return x._replace(scale=None if factor.number == 1 else factor)
 
 
-_WORDS = {"add": "add", "sub": "subtract", "mul": "multiply"}
+_NUMPY_NAMES = {"add": "add", "sub": "subtract", "mul": "multiply"}
 
 
-def _key_of(x: _Held) -> Any:
+def _key_of(x: _Constant) -> Any:
     """The identity of an array, or the bits of a number: 0.0 and -0.0 are different keys."""
     return id(x.value) if x.number is None else (x.number.dtype, x.number.tobytes())
 
@@ -554,10 +571,3 @@ def _operation(eqn) -> Any:
     except TypeError:
         return None
     return None if eqn.effects else key
-
-
-def _binder(eqn):
-    parameters = eqn.primitive.get_bind_params(eqn.params)
-    # older versions of JAX return functions too
-    funs, params = parameters if isinstance(parameters, tuple) else ((), parameters)
-    return lambda *operands: eqn.primitive.bind(*funs, *operands, **params)

@@ -4,7 +4,7 @@ A fused kernel is called a *unit* in this package, after its primitive. ``README
 attributes of XLA that make one, and why every operand of a unit must be used.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from functools import reduce
 from typing import Any
@@ -16,14 +16,15 @@ from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
 from polhode import _policy
-from polhode._kernels._derivatives import is_slope, linear
+from polhode._kernels._derivatives import is_nonzero_tangent, linear
+from polhode._kernels._programs import constants_as_operands, dependent_results, nested_jaxprs
 
-_HOLDABLE = frozenset(
+_FUSIBLE_OPERATIONS = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
      broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy cos cosh
      custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
@@ -68,12 +69,12 @@ def kernel(
         outer = _ANALYSING.get()
         if outer is not None:
             outer.append(fn)
-        if outer is not None or not _is_of_use():
+        if outer is not None or not _uses_kernels():
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
         if not any(isinstance(leaf, Tracer) for leaf in leaves):
             return fn(*operands)  # outside of jit, calls inside would inherit the attributes
-        # Units inside are inlined, so that ``is_holdable`` sees their operations. With ``of_units``
+        # Units inside are inlined, so that ``is_fusible`` sees their operations. With ``of_units``
         # they stay units, and remain so in a derivative, which is not one unit as a whole.
         inner: list[Callable] = []
         analysing = _ANALYSING.set(None if of_units else inner)
@@ -83,14 +84,14 @@ def kernel(
             )(*leaves)
         finally:
             _ANALYSING.reset(analysing)
-        if not is_holdable(closed_jaxpr.jaxpr):
+        if not is_fusible(closed_jaxpr.jaxpr):
             if not inner:  # no units were inlined: the traced program is that of ``fn``
                 return jax.tree.unflatten(
                     jax.tree.structure(shape), jaxpr_as_fun(closed_jaxpr)(*leaves)
                 )
             return fn(*operands)
-        program, constants = _with_constants_as_operands(closed_jaxpr)
-        results = _unit(jaxpr_as_fun(program), linearised, (program, 0), repeated, of_units)(
+        program, constants = constants_as_operands(closed_jaxpr, _is_kernel_operand)
+        results = _unit(jaxpr_as_fun(program), linearised, program, 0, repeated, of_units)(
             *constants, *leaves
         )
         return jax.tree.unflatten(jax.tree.structure(shape), results)
@@ -108,31 +109,31 @@ def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
 
 
 @custom_vmap
-def any_of(these: jax.Array) -> jax.Array:
+def any_of(values: jax.Array) -> jax.Array:
     """Whether any entry is not zero, under ``vmap`` in the whole batch.
 
     As the condition of a ``while_loop`` it is one for the whole batch. With a condition for each
     body JAX would select between the old and the new carry of each body in every iteration.
     """
-    return jnp.sum(jnp.where(these != 0, 1, 0)) > 0
+    return jnp.sum(jnp.where(values != 0, 1, 0)) > 0
 
 
 @any_of.def_vmap
-def _any_of_all(size, batched, these):
+def _any_of_whole_batch(size, batched, values):
     del size, batched
-    return any_of(these), False
+    return any_of(values), False
 
 
 @custom_vmap
-def most_of(count: jax.Array) -> jax.Array:
+def max_over_batch(count: jax.Array) -> jax.Array:
     """``count``, under ``vmap`` the largest one of the batch: a loop bound common to all bodies."""
     return count
 
 
-@most_of.def_vmap
-def _most_of_all(size, batched, count):
+@max_over_batch.def_vmap
+def _max_over_whole_batch(size, batched, count):
     del size, batched
-    return most_of(jnp.max(count)), False
+    return max_over_batch(jnp.max(count)), False
 
 
 @jax.custom_jvp
@@ -184,34 +185,16 @@ def _flat(x: jax.Array) -> jax.Array:
     return x.reshape(-1, x.shape[-1])
 
 
-def _with_constants_as_operands(closed_jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program with its closed-over values as first operands, since they may be differentiated.
+def _is_kernel_operand(constant: Any) -> bool:
+    """Whether a value over which a function closes becomes an operand of its unit: traced values,
+    since they may be differentiated, and large arrays.
 
-    Small constant arrays, such as the tables of a Runge-Kutta method, stay inside: as operands they
-    would be carried through every loop. Returns the program and these operands."""
-    jaxpr, constants = (
-        closed_jaxpr.jaxpr,
-        list(zip(closed_jaxpr.jaxpr.constvars, closed_jaxpr.consts, strict=True)),
-    )
-    tables = [
-        (v, x)
-        for v, x in constants
-        if not isinstance(x, Tracer) and np.size(x) <= _policy.KERNEL_TABLE
-    ]
-    others = [
-        (v, x) for v, x in constants if isinstance(x, Tracer) or np.size(x) > _policy.KERNEL_TABLE
-    ]
-    names = jaxpr.debug_info.arg_names
-    names = None if names is None else ("",) * len(others) + (*names,)
-    jaxpr_of_all = jaxpr.replace(
-        constvars=[v for v, _ in tables],
-        invars=[*(v for v, _ in others), *jaxpr.invars],
-        debug_info=jaxpr.debug_info._replace(arg_names=names),
-    )
-    return ClosedJaxpr(jaxpr_of_all, [x for _, x in tables]), [x for _, x in others]
+    Small arrays, such as the tables of a Runge-Kutta method, stay inside: as operands they would be
+    carried through every loop."""
+    return isinstance(constant, Tracer) or np.size(constant) > _policy.KERNEL_TABLE
 
 
-def _is_of_use() -> bool:
+def _uses_kernels() -> bool:
     """Whether units are used: on a CPU, unless XLA partitions arrays, which it cannot in a unit."""
     if not _policy.is_fused():
         return False
@@ -221,15 +204,15 @@ def _is_of_use() -> bool:
     return by_hand or jax.device_count() == 1
 
 
-def is_holdable(jaxpr: Any, batched: bool = False) -> bool:
+def is_fusible(jaxpr: Any, batched: bool = False) -> bool:
     """Whether a unit can contain this program; ``batched``: it was made by ``vmap``."""
-    return not _sums_widely(jaxpr) and all(
+    return not _has_large_reduction(jaxpr) and all(
         all(
-            equation.primitive.name in _HOLDABLE or (batched and _updates_slice(equation))
+            equation.primitive.name in _FUSIBLE_OPERATIONS or (batched and _updates_slice(equation))
             for equation in program.eqns
         )
-        and all(_is_packable(v.aval.dtype) for v in (*program.invars, *program.constvars))
-        for program in _programs(jaxpr)
+        and all(_is_numeric(v.aval.dtype) for v in (*program.invars, *program.constvars))
+        for program in nested_jaxprs(jaxpr)
     )
 
 
@@ -239,30 +222,18 @@ def _updates_slice(equation: Any) -> bool:
     return equation.primitive.name == "scatter" and equation.invars[1].aval.ndim == 1
 
 
-def _sums_widely(jaxpr: Any) -> bool:
+def _has_large_reduction(jaxpr: Any) -> bool:
     """Whether a reduction has so many floats that XLA calls a library, which a unit cannot."""
     return any(
         equation.primitive.name.startswith("reduce_")
         and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
         and equation.invars[0].aval.size >= _policy.KERNEL_SUM
-        for program in _programs(jaxpr)
+        for program in nested_jaxprs(jaxpr)
         for equation in program.eqns
     )
 
 
-def _programs(jaxpr: Any) -> Iterator[Any]:
-    """A jaxpr and all jaxprs nested in it, such as the bodies of loops."""
-    yield jaxpr
-    for equation in jaxpr.eqns:
-        for value in jax.tree.leaves(
-            list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
-        ):
-            nested = getattr(value, "jaxpr", value)
-            if hasattr(nested, "eqns"):
-                yield from _programs(nested)
-
-
-def _is_packable(dtype) -> bool:
+def _is_numeric(dtype) -> bool:
     """Whether arrays are numbers or truth values: neither random keys nor tangents of integers."""
     return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
 
@@ -270,21 +241,22 @@ def _is_packable(dtype) -> bool:
 def _unit(
     flat: Callable,
     linearised: bool,
-    traced: Any = None,
+    traced: ClosedJaxpr | None = None,
+    exempt_count: int = 0,
     repeated: bool = False,
     of_units: bool = False,
 ) -> Callable:
     """``flat``, a function of arrays with a list of results, as one differentiable unit.
 
-    ``traced``: the jaxpr of ``flat`` if it exists already, and the ``exempt_count`` of
-    ``_unit_call``; other arguments as in ``kernel``.
+    ``traced``: the jaxpr of ``flat`` if it exists already; ``exempt_count``: see ``_unit_call``;
+    other arguments as in ``kernel``.
     """
 
     @jax.custom_jvp
     def unit(*leaves):
-        closed_jaxpr, exempt_count = traced or (jax.make_jaxpr(flat)(*leaves), 0)
-        if traced is None and not is_holdable(closed_jaxpr.jaxpr):
-            return _batched_alike(jaxpr_as_fun(closed_jaxpr)(*leaves), leaves)
+        closed_jaxpr = traced or jax.make_jaxpr(flat)(*leaves)
+        if traced is None and not is_fusible(closed_jaxpr.jaxpr):
+            return _with_common_batch_axes(jaxpr_as_fun(closed_jaxpr)(*leaves), leaves)
         return _unit_call(closed_jaxpr, leaves, exempt_count, of_units)
 
     def derivative(leaves, tangents):
@@ -297,12 +269,12 @@ def _unit(
 
         if repeated:
             value = unit(*leaves)
-            return value, _of_units(of_active, active_places, leaves, tangents, value)
+            return value, _tangents_by_units(of_active, active_places, leaves, tangents, value)
 
         def without_units():
             arguments = [leaves[k] for k in active_places], [tangents[k] for k in active_places]
-            values, slopes = jax.jvp(lambda *x: of_active(leaves, x), *arguments)
-            return _batched_alike(values, leaves), slopes
+            values, value_tangents = jax.jvp(lambda *x: of_active(leaves, x), *arguments)
+            return _with_common_batch_axes(values, leaves), value_tangents
 
         # For second derivatives, ``fn`` is differentiated twice: to differentiate the coefficients
         # of its linearisation takes twice as long to compile.
@@ -322,36 +294,36 @@ def _unit(
             return [*value, *coefficients, jnp.zeros((), jnp.float32)]
 
         linearisation = jax.make_jaxpr(value_and_coefficients)(*leaves)
-        if not is_holdable(linearisation.jaxpr):  # a custom rule may contain, for example, a sort
+        if not is_fusible(linearisation.jaxpr):  # a custom rule may contain, for example, a sort
             return without_units()
         tree, count = shape
-        exempt_count = len(linearisation.out_avals) - 1 - count
+        coefficient_count = len(linearisation.out_avals) - 1 - count
         of_all = _unit(
-            jaxpr_as_fun(linearisation), False, (linearisation, exempt_count), of_units=of_units
+            jaxpr_as_fun(linearisation), False, linearisation, coefficient_count, of_units=of_units
         )
         *results, zero = of_all(*leaves)
         # Not a unit: its transpose would have operands that are not used.
         linear_map = jax.tree.unflatten(tree, results[count:])
         return results[:count], linear_map(
-            *(_on_condition(zero, tangents[k]) for k in active_places)
+            *(_selected_if_zero(zero, tangents[k]) for k in active_places)
         )
 
     unit.defjvp(derivative, symbolic_zeros=True)
     return unit
 
 
-def _batched_alike(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[jax.Array]:
+def _with_common_batch_axes(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[jax.Array]:
     """``results``, each with the batch axes of all ``leaves``.
 
     Under ``vmap`` all results of a unit are batched, even those that depend on no batched operand.
     JAX requires the same batch axes of the values that a custom derivative returns. Here every
     result is selected by a condition that reads all leaves."""
-    firsts = [x[(0,) * x.ndim] for x in map(jnp.asarray, leaves) if x.size]
-    always_true = reduce(jnp.logical_or, (x == x for x in firsts), True)
+    first_entries = [x[(0,) * x.ndim] for x in map(jnp.asarray, leaves) if x.size]
+    always_true = reduce(jnp.logical_or, (x == x for x in first_entries), True)
     return [jax.lax.select(jnp.broadcast_to(always_true, x.shape), x, x) for x in results]
 
 
-def _of_units(
+def _tangents_by_units(
     of_active: Callable, active_places: Sequence[int], leaves, tangents, like
 ) -> list[Any]:
     """Tangents of ``of_active``: the linear map is one unit and its transpose another.
@@ -362,37 +334,39 @@ def _of_units(
     count = len(leaves)
     floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
 
-    def slope(leaves, changes):
+    def tangents_of(leaves, active_tangents):
         primals = [leaves[k] for k in active_places]
-        results = jax.jvp(lambda *x: of_active(leaves, x), primals, list(changes))[1]
+        results = jax.jvp(lambda *x: of_active(leaves, x), primals, list(active_tangents))[1]
         return [results[k] for k in floats]
 
-    def along(*arrays):
-        return slope(arrays[:count], arrays[count:])
+    def pushforward(*arrays):
+        return tangents_of(arrays[:count], arrays[count:])
 
-    def against(*arrays):
-        leaves, slopes = arrays[:count], list(arrays[count:])
+    def pullback(*arrays):
+        leaves, cotangents = arrays[:count], list(arrays[count:])
         # ``jax.vjp`` would take 1.5 times as long to trace.
-        back = jax.linear_transpose(
-            lambda *d: slope(leaves, d), *(leaves[k] for k in active_places)
+        transpose = jax.linear_transpose(
+            lambda *d: tangents_of(leaves, d), *(leaves[k] for k in active_places)
         )
-        return list(back(slopes))
+        return list(transpose(cotangents))
 
-    def forward(constants, changes):
-        return _unit(along, False, repeated=True)(*constants, *changes)
+    def forward(constants, active_tangents):
+        return _unit(pushforward, False, repeated=True)(*constants, *active_tangents)
 
-    def backward(constants, slopes):
-        return _unit(against, False, repeated=True)(*constants, *slopes)
+    def backward(constants, cotangents):
+        return _unit(pullback, False, repeated=True)(*constants, *cotangents)
 
-    changes = [tangents[k] for k in active_places]
-    by_place = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
+    active_tangents = [tangents[k] for k in active_places]
+    by_place = dict(
+        zip(floats, linear(forward, backward, leaves, active_tangents, list(floats.values())))
+    )
     float0_tangents = {
         k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats
     }
     return [(by_place | float0_tangents)[k] for k in range(len(like))]
 
 
-def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
+def _selected_if_zero(zero: jax.Array, tangent: jax.Array) -> jax.Array:
     """The tangent, selected on the condition that ``zero`` is 0, which is always true: it makes
     ``zero`` a used result of its unit."""
     if tangent.dtype == jax.dtypes.float0:
@@ -416,7 +390,7 @@ def _unit_call(
     jaxpr, is_used = partial_eval.dce_jaxpr(
         closed_jaxpr.jaxpr, [True] * len(closed_jaxpr.out_avals)
     )
-    arrays = [jnp.asarray(x) for x, keep in zip(arguments, is_used, strict=True) if keep]
+    arrays = [jnp.asarray(x) for x, is_kept in zip(arguments, is_used, strict=True) if is_kept]
     operands = [x for x in arrays if x.size]
     if not operands:
         return jaxpr_as_fun(closed_jaxpr)(*arguments)
@@ -432,8 +406,8 @@ def _unit_call(
                 all_operands.insert(k, jnp.zeros(shape, dtype))
             results = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed_jaxpr.consts))(*all_operands)
             # the first entry of each operand is read, even if XLA folds all its uses in the program
-            firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
-            always_true = reduce(jnp.logical_or, firsts, zeros[0] == 0)
+            first_entries = (x[(0,) * x.ndim].astype(bool) for x in operands)
+            always_true = reduce(jnp.logical_or, first_entries, zeros[0] == 0)
             # XLA does not repeat a division; without it, it evaluated the condition again for each
             # result, which made up a quarter of the program
             always_true = jnp.where(always_true, 1, 0) / (1 - zeros[1]) > 0
@@ -499,27 +473,27 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
     Outside of a unit the same arithmetic takes a hundred times as long, because XLA repeats values
     that several results share."""
     if of_units:  # the units inside are batched, each by this rule
-        out_axes = [0 if x else None for x in _depend_on(program, arrays, dims)]
+        out_axes = [0 if x else None for x in _batched_results(program, arrays, dims)]
         return jax.vmap(program, list(dims), out_axes)(*arrays), out_axes
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     places = [k for k, d in enumerate(dims) if d is not None]
 
     def unit_of_one(lane):
-        whole = dict(enumerate(arrays)) | dict(zip(places, lane))
-        return _unit_p.bind(*whole.values(), program=program, shapes=shapes, of_units=False)
+        all_arrays = dict(enumerate(arrays)) | dict(zip(places, lane))
+        return _unit_p.bind(*all_arrays.values(), program=program, shapes=shapes, of_units=False)
 
     def unit_of(lanes):
-        whole = list(arrays)
+        all_arrays = list(arrays)
         for k, x in zip(places, lanes):
-            whole[k] = x
+            all_arrays[k] = x
         count = lanes[0].shape[0]
         in_axes = [0 if k in places else None for k in range(len(arrays))]
-        closed_jaxpr = jax.make_jaxpr(jax.vmap(program, in_axes))(*whole)
+        closed_jaxpr = jax.make_jaxpr(jax.vmap(program, in_axes))(*all_arrays)
         batch = jaxpr_as_fun(closed_jaxpr)
-        if _sums_widely(closed_jaxpr.jaxpr):
-            return batch(*whole)
+        if _has_large_reduction(closed_jaxpr.jaxpr):
+            return batch(*all_arrays)
         # where bodies write slices at different indices, ``vmap`` makes a scatter of the writes
-        if not is_holdable(closed_jaxpr.jaxpr, batched=True):
+        if not is_fusible(closed_jaxpr.jaxpr, batched=True):
             return jax.lax.map(unit_of_one, lanes)
 
         def batched_program(*arrays):
@@ -527,13 +501,15 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
                 return batch(*arrays)
 
         of_batch = tuple(((count, *shape), *kind) for shape, *kind in shapes)
-        return _unit_p.bind(*whole, program=batched_program, shapes=of_batch, of_units=False)
+        return _unit_p.bind(*all_arrays, program=batched_program, shapes=of_batch, of_units=False)
 
     lanes = [jnp.moveaxis(arrays[k], dims[k], 0) for k in places]
     return map_chunks(unit_of, lanes, size, _policy.KERNEL_BATCH), [0] * len(shapes)
 
 
-def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | None]) -> list[bool]:
+def _batched_results(
+    program: Callable, arrays: Sequence[Any], dims: Sequence[int | None]
+) -> list[bool]:
     """Which results of a program depend on arrays that have a batch axis.
 
     The others, such as times common to all bodies, get no batch axis: if each body had times of its
@@ -541,11 +517,7 @@ def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | No
     lanes = [jnp.shape(x) if d is None else np.delete(x.shape, d) for x, d in zip(arrays, dims)]
     lanes = [jax.ShapeDtypeStruct(tuple(shape), x.dtype) for shape, x in zip(lanes, arrays)]
     jaxpr = jax.make_jaxpr(program)(*lanes).jaxpr
-    dependent = {v for v, d in zip(jaxpr.invars, dims) if d is not None}
-    for equation in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in dependent for v in equation.invars):
-            dependent.update(equation.outvars)
-    return [not isinstance(v, Literal) and v in dependent for v in jaxpr.outvars]
+    return dependent_results(jaxpr, [d is not None for d in dims])
 
 
 def _unit_jvp(arrays, tangents, *, program, **_):
@@ -553,14 +525,14 @@ def _unit_jvp(arrays, tangents, *, program, **_):
 
     The custom derivative of ``_unit`` comes first. This rule is used where that derivative has been
     traced already and JAX differentiates the result once more, as in a loop."""
-    at = [k for k, x in enumerate(tangents) if is_slope(x)]
+    at = [k for k, x in enumerate(tangents) if is_nonzero_tangent(x)]
 
     def of_active(*values):
         return list(program(*(dict(enumerate(arrays)) | dict(zip(at, values))).values()))
 
-    values, slopes = jax.jvp(of_active, [arrays[k] for k in at], [tangents[k] for k in at])
+    values, value_tangents = jax.jvp(of_active, [arrays[k] for k in at], [tangents[k] for k in at])
     zero = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in values]
-    return values, [x if is_slope(x) else z for x, z in zip(slopes, zero)]
+    return values, [x if is_nonzero_tangent(x) else z for x, z in zip(value_tangents, zero)]
 
 
 ad.primitive_jvps[_unit_p] = _unit_jvp
