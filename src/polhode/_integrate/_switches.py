@@ -38,7 +38,8 @@ _OPAQUE = _NOT_DIFFERENTIABLE | frozenset(
 """Operations whose switches are not found: ``Switched.hidden_operations`` names them."""
 
 _CONSTANT = frozenset(("eq", "ne", "is_finite"))
-"""Comparisons that turn at single points of a motion, or in one that has failed."""
+"""Comparisons that turn at single points of a motion, or in one that has failed: except with a
+kink. ``max(x, 0) == 0`` holds on one side of it, as in the derivative of ``max``."""
 
 _PIVOTED = frozenset(("lu",))
 """Operations with integers among their results, of which what is solved with them is smooth."""
@@ -73,7 +74,8 @@ class Switched(NamedTuple):
 
 
 STATE, TIME = 1, 2
-"""What a value moves with; 3 with both, 0 with neither."""
+"""What a value moves with: 3 with both, 0 with neither. The bits above these name the switches of
+kinks (``_Walk.kinks``) that the value has passed."""
 
 
 def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Switched:
@@ -102,7 +104,7 @@ def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Sw
     def note(*args):
         chooser = _Free(dtype)
         _, walk = run(args, chooser)
-        jumps.extend(chooser.jumps)
+        jumps.extend(jump or k in walk.jumping for k, jump in enumerate(chooser.jumps))
         timed.extend(walk.timed)
         hidden_operations.extend(walk.hidden_operations)
         return chooser.collect()
@@ -210,19 +212,20 @@ class _Free:
         return jnp.concatenate(self.levels) if self.levels else jnp.zeros(0, self.dtype)
 
 
-def _may_switch(jaxpr) -> bool:
-    """Whether a program holds an operation that may be a switch, or hide one."""
+def _may_switch(jaxpr, moves: int = 0) -> bool:
+    """Whether a program holds an operation that may be a switch, or hide one, or of which kinks
+    among what its operands have passed make jumps; ``moves``: of its operands."""
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name in _CALLS and eqn.params.get("name") == SMOOTH:
             continue
         if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE:
             return True
-        if name == _COMPOSED or _is_step(eqn):
+        if name == _COMPOSED or _is_step(eqn) or (moves > STATE | TIME and _is_equality(eqn)):
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
-        if any(_may_switch(subjaxpr) for subjaxpr in _subjaxprs(eqn)):
+        if any(_may_switch(subjaxpr, moves) for subjaxpr in _subjaxprs(eqn)):
             return True
     return False
 
@@ -257,6 +260,16 @@ def _is_step(eqn) -> bool:
     return any(map(_is_float, eqn.invars)) and not any(True for _ in _subjaxprs(eqn))
 
 
+def _is_equality(eqn) -> bool:
+    """Whether an operation compares floats for equality; ``x != x`` is a test for NaN."""
+    name, variables = eqn.primitive.name, eqn.invars
+    if name not in _CONSTANT and name != "convert_element_type":
+        return False
+    is_nan_test = name in ("eq", "ne") and variables[0] is variables[1]
+    to_bool = eqn.outvars[0].aval.dtype == bool
+    return to_bool and any(map(_is_float, variables)) and not is_nan_test
+
+
 def _to_integer(eqn) -> bool:
     return _is_float(eqn.invars[0]) and _is_integer(eqn.params["new_dtype"])
 
@@ -271,6 +284,8 @@ class _Walk:
     def __init__(self, chooser):
         self.chooser, self.hidden_operations = chooser, []
         self.moves, self.timed = 0, []  # of the operation at hand; of each switch
+        self.kinks: list[range] = []  # the switches of each kink
+        self.jumping: set[int] = set()  # those at which the results jump for a comparison after it
 
     def jaxpr(self, jaxpr, consts, args):
         env: dict[Any, Any] = {v: (c, 0) for v, c in zip(jaxpr.constvars, consts)}
@@ -288,21 +303,31 @@ class _Walk:
         return self.choose(u, rule, jumps) > 0
 
     def choose(self, u, rule: _Rule, jumps: bool):
-        self.timed.extend([self.moves == TIME] * jnp.size(u))
+        begin = len(self.timed)
+        self.timed.extend([self.moves & (STATE | TIME) == TIME] * jnp.size(u))
+        if not jumps:
+            self.kinks.append(range(begin, len(self.timed)))
         return self.chooser.choose(u, rule, jumps)
+
+    def _kinks_jump(self, moves: int):
+        """Kinks that a value has passed make what follows jump: it is compared for equality."""
+        for k, places in enumerate(self.kinks):
+            if moves >> (k + 2) & 1:
+                self.jumping.update(places)
 
     def equation(self, eqn, operands):
         name, x = eqn.primitive.name, [value for value, _ in operands]
         self.moves = moves = reduce(or_, (m for _, m in operands), 0)
         if moves and name in _CALLS and eqn.params.get("name") != SMOOTH:
             for subjaxpr in _subjaxprs(eqn):
-                if _may_switch(subjaxpr):
+                if _may_switch(subjaxpr, moves):
                     return self._call(eqn, operands)
-        if moves and name == "scan" and any(map(_may_switch, _subjaxprs(eqn))):
+        if moves and name == "scan" and any(_may_switch(x, moves) for x in _subjaxprs(eqn)):
             return self._scan(eqn, operands)
         branches = list(_subjaxprs(eqn)) if moves and name == "cond" else []
         # a check (``eqx.error_if``) runs in its own branch alone
-        if any(map(_may_switch, branches)) and not any(map(_calls_back, branches)):
+        switches = any(_may_switch(branch, moves) for branch in branches)
+        if switches and not any(map(_calls_back, branches)):
             return self._cond(eqn, operands)
         if moves and name == _COMPOSED:
             return self._expanded(eqn, operands)
@@ -314,9 +339,14 @@ class _Walk:
             self.hidden_operations.append(name)
         first_var = next((v for v in eqn.invars if not isinstance(v, Literal)), None)
         if moves and eqn.outvars and first_var is not None and _is_float(first_var):
+            kinks = len(self.kinks)
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
+                for k in range(kinks, len(self.kinks)):
+                    moves |= 1 << (k + 2)
                 return [(o, moves if m else 0) for o, m in outputs]
+        if moves and _is_equality(eqn):
+            self._kinks_jump(moves)
         if moves and _is_step(eqn):
             self.hidden_operations.append(name)
         out = _bind(eqn, x)
