@@ -61,6 +61,9 @@ def program(fn, *examples):
         (lambda x: jax.lax.scan(lambda s, row: (s + jnp.abs(row), row), 0.0, x)[0], 3, False),
         (lambda x: jnp.interp(x[0], jnp.arange(4.0), jnp.array([0.0, 1.0, 0.5, 2.0])), None, True),
         (lambda x: jnp.linalg.norm(x), 0, False),
+        (lambda x: jnp.log(jax.lax.complex(x[0] - 2, x[1])).imag, 1, True),
+        (lambda x: jnp.sqrt(jax.lax.complex(x[0] - 2, x[1])).imag, 1, True),
+        (lambda x: (jax.lax.complex(x[0] - 2, x[1]) ** 0.3).imag, 1, True),
         (lambda x: jnp.where(jnp.clip(x, -1.0, 1.0) == x, 1.0, 0.5) + jnp.abs(x), 9, True),
         (lambda x: jax.jit(jnp.where)(jnp.maximum(x, 0.0).astype(bool), 0.5, 0.0), 3, True),
         (lambda x: jnp.where(jnp.isnan(jnp.maximum(x, 0.0)), 0.0, x), 3, False),
@@ -98,6 +101,8 @@ def test_what_cannot_be_looked_into_is_named():
         return jax.lax.while_loop(lambda s: jnp.sum(s * s) > 1, lambda s: s / 2, x)
 
     assert program(halved, jnp.ones(3)).hidden_operations == ("while",)
+    found = program(lambda x: jnp.arccos(jax.lax.complex(x, x)).real, jnp.ones(3))
+    assert found.hidden_operations == ("acos",)
     scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(lambda t, wxyz, omega: halved(omega)))
     state = ph.State(WXYZ, OMEGA)
     assert "contains while" in str(ph.explain(scene, state, TS))

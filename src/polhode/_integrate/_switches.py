@@ -41,6 +41,12 @@ _CONSTANT = frozenset(("eq", "ne", "is_finite"))
 """Comparisons that turn at single points of a motion, or in one that has failed: except with a
 kink. ``max(x, 0) == 0`` holds on one side of it, as in the derivative of ``max``."""
 
+_CONTINUED = frozenset(("log", "sqrt", "rsqrt", "pow"))
+"""Functions of complex numbers that are continued over their branch cut, the negative axis."""
+
+_BRANCHED = _CONTINUED | frozenset("log1p asin acos atan asinh acosh atanh".split())  # noqa: SIM905
+"""Functions of complex numbers that jump at a branch cut."""
+
 _PIVOTED = frozenset(("lu",))
 """Operations with integers among their results, of which what is solved with them is smooth."""
 
@@ -221,7 +227,9 @@ def _may_switch(jaxpr, moves: int = 0) -> bool:
             continue
         if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE:
             return True
-        if name == _COMPOSED or _is_step(eqn) or (moves > STATE | TIME and _is_equality(eqn)):
+        if name == _COMPOSED or _is_step(eqn) or _is_branched(eqn):
+            return True
+        if moves > STATE | TIME and _is_equality(eqn):
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
@@ -258,6 +266,12 @@ def _is_step(eqn) -> bool:
     if name == "convert_element_type" or name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED:
         return False
     return any(map(_is_float, eqn.invars)) and not any(True for _ in _subjaxprs(eqn))
+
+
+def _is_branched(eqn) -> bool:
+    return eqn.primitive.name in _BRANCHED and jnp.issubdtype(
+        eqn.invars[0].aval.dtype, jnp.complexfloating
+    )
 
 
 def _is_equality(eqn) -> bool:
@@ -345,6 +359,10 @@ class _Walk:
                 for k in range(kinks, len(self.kinks)):
                     moves |= 1 << (k + 2)
                 return [(o, moves if m else 0) for o, m in outputs]
+        if moves and _is_branched(eqn):
+            if name in _CONTINUED:
+                return [(self._continued(eqn, name, x), moves)]
+            self.hidden_operations.append(name)
         if moves and _is_equality(eqn):
             self._kinks_jump(moves)
         if moves and _is_step(eqn):
@@ -388,15 +406,8 @@ class _Walk:
             return [
                 (self._integer_level(x[0], _TRUNC, eqn.invars[0].aval).astype(out.dtype), False)
             ]
-        # On the negative axis the angle jumps by a turn. With the side of y held it goes on
-        # smoothly, and the jump becomes a switch.
         if name == "atan2":
-            y, x = x
-            is_upper, around = self.side(y, True), jnp.asarray(2 * np.pi, out.dtype)
-            turn = jnp.where(
-                is_upper & (y < 0), around, jnp.where(~is_upper & (y >= 0), -around, 0)
-            )
-            return [(jnp.arctan2(y, x) + jnp.where(x < 0, turn, 0), True)]
+            return [(jnp.arctan2(*x) + self._turn(*x), True)]
         if name in ("reduce_max", "reduce_min"):
             value, _ = self._extreme(x[0], eqn.params["axes"], name == "reduce_max")
             return [(value, True)]
@@ -433,6 +444,25 @@ class _Walk:
         if name in _SORTS:
             self.hidden_operations.append(name)
         return None
+
+    def _turn(self, y, x):
+        """What continues the angle of (x, y) over the negative axis, where it jumps by a turn: with
+        the side of y held it goes on smoothly, and the jump is a switch."""
+        y = jnp.asarray(y)
+        is_upper, around = self.side(y, True), jnp.asarray(2 * np.pi, y.dtype)
+        turn = jnp.where(is_upper & (y < 0), around, jnp.where(~is_upper & (y >= 0), -around, 0))
+        return jnp.where(x < 0, turn, 0)
+
+    def _continued(self, eqn, name, x):
+        """A function of complex numbers on the sheet of the side that is held."""
+        (principal,) = _bind(eqn, x)
+        turn = self._turn(jnp.imag(x[0]), jnp.real(x[0]))
+        if name in ("sqrt", "rsqrt"):
+            return jnp.where(turn == 0, principal, -principal)
+        change = jax.lax.complex(jnp.zeros_like(turn), turn)
+        if name == "log":
+            return principal + change
+        return principal * jnp.exp(change * jnp.asarray(x[1], change.dtype))
 
     def _select_larger(self, a, b, larger: bool):
         """The larger (or the smaller) of two."""
