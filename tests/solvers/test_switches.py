@@ -61,6 +61,14 @@ def program(fn, *examples):
         (lambda x: jax.lax.scan(lambda s, row: (s + jnp.abs(row), row), 0.0, x)[0], 3, False),
         (lambda x: jnp.interp(x[0], jnp.arange(4.0), jnp.array([0.0, 1.0, 0.5, 2.0])), None, True),
         (lambda x: jnp.linalg.norm(x), 0, False),
+        (lambda x: jnp.log(jax.lax.complex(x[0] - 2, x[1])).imag, 1, True),
+        (lambda x: jnp.sqrt(jax.lax.complex(x[0] - 2, x[1])).imag, 1, True),
+        (lambda x: (jax.lax.complex(x[0] - 2, x[1]) ** 0.3).imag, 1, True),
+        (lambda x: jnp.where(jnp.clip(x, -1.0, 1.0) == x, 1.0, 0.5) + jnp.abs(x), 9, True),
+        (lambda x: jax.jit(jnp.where)(jnp.maximum(x, 0.0).astype(bool), 0.5, 0.0), 3, True),
+        (lambda x: jnp.where(jnp.isnan(jnp.maximum(x, 0.0)), 0.0, x), 3, False),
+        (jax.grad(jnp.max), 2, True),
+        (jax.grad(lambda x: jnp.sum(jnp.maximum(x, 0.2))), 3, True),
         (smooth(lambda x: jnp.where(x > 0, x, x)), 0, False),
     ],
 )
@@ -95,6 +103,8 @@ def test_what_cannot_be_looked_into_is_named():
         return jax.lax.while_loop(lambda s: jnp.sum(s * s) > 1, lambda s: s / 2, x)
 
     assert program(halved, jnp.ones(3)).hidden_operations == ("while",)
+    found = program(lambda x: jnp.arccos(jax.lax.complex(x, x)).real, jnp.ones(3))
+    assert found.hidden_operations == ("acos",)
     scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(lambda t, wxyz, omega: halved(omega)))
     state = ph.State(WXYZ, OMEGA)
     assert "contains while" in str(ph.explain(scene, state, TS))
@@ -180,6 +190,23 @@ def looked_up(p, rate):
 def largest(p, rate):
     """The same in two ranges, from the index of the largest of three numbers."""
     return jnp.array([0.1, 0.2, 0.3])[jnp.argmax(jnp.stack([p, rate, 0.1 * p]))]
+
+
+@pytest.mark.slow  # the switches themselves: test_every_switch_of_a_program_is_found
+def test_derivatives_through_a_kink_of_a_potential():
+    """A constant torque from an angle on: the derivative of ``maximum`` compares for equality."""
+
+    def final_rate(rate, torque):
+        def energy(R, t):
+            return torque * jnp.maximum(jnp.arctan2(R[1, 0], R[0, 0]) - 0.5, 0.0)
+
+        scene = ph.Scene(ph.Inertia.spherical(1.0), ph.Potential(energy))
+        state = ph.State([1.0, 0, 0, 0], rate * jnp.eye(3)[2])
+        return ph.simulate(scene, state, [0.0, 2.0]).last.omega_body[2]
+
+    value, slopes = jax.jit(jax.value_and_grad(final_rate, (0, 1)))(1.0, 0.1)
+    np.testing.assert_allclose(value, 1 - 0.1 * 1.5, rtol=1e-9)
+    np.testing.assert_allclose(slopes, (1 - 0.1 * 0.5, -1.5), rtol=1e-8)
 
 
 @pytest.mark.parametrize(

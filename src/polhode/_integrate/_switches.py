@@ -39,7 +39,14 @@ _OPAQUE = _NOT_DIFFERENTIABLE | frozenset(
 
 _CONSTANT = frozenset(("eq", "ne", "is_finite"))
 """Comparisons that change at isolated points of a motion only, or in one that has failed: they are
-not switches."""
+not switches. They change the effect of kinks before them: ``max(x, 0) == 0``, which the derivative
+of ``max`` contains, holds on one side of the kink."""
+
+_CONTINUED = frozenset(("log", "sqrt", "rsqrt", "pow"))
+"""Complex functions that are continued over their branch cut, the negative real axis."""
+
+_BRANCHED = _CONTINUED | frozenset("log1p asin acos atan asinh acosh atanh".split())  # noqa: SIM905
+"""Complex functions that jump at a branch cut."""
 
 _PIVOTED = frozenset(("lu",))
 """Operations that return integers (pivots), although solutions computed with them are smooth."""
@@ -75,7 +82,8 @@ class SwitchedProgram(NamedTuple):
 
 
 STATE, TIME = 1, 2
-"""What a value varies with: the state, the time, both (3) or neither (0)."""
+"""What a value varies with: the state, the time, both (3) or neither (0). Higher bits are set for
+the kinks (``_Interpreter.kinks``) that the value depends on."""
 
 
 def switches_of(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> SwitchedProgram:
@@ -105,7 +113,7 @@ def switches_of(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) ->
     def collect_properties(*args):
         level_source = _ComputedLevels(dtype)
         _, interpreter = run(args, level_source)
-        jumps.extend(level_source.jumps)
+        jumps.extend(x or k in interpreter.jumping for k, x in enumerate(level_source.jumps))
         timed.extend(interpreter.timed)
         hidden_operations.extend(interpreter.hidden_operations)
         return level_source.collect()
@@ -214,19 +222,22 @@ class _ComputedLevels:
         return jnp.concatenate(self.levels) if self.levels else jnp.zeros(0, self.dtype)
 
 
-def _may_switch(jaxpr) -> bool:
-    """Whether a program contains an operation that may be a switch or contain one."""
+def _may_switch(jaxpr, variation: int = 0) -> bool:
+    """Whether a program contains an operation that may be a switch or contain one, or that turns
+    kinks of its operands into jumps; ``variation``: of the operands."""
     for eqn in jaxpr.eqns:
         name = eqn.primitive.name
         if name in _CALLS and eqn.params.get("name") == SMOOTH:
             continue
         if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE:
             return True
-        if name == _COMPOSED or _is_step(eqn):
+        if name == _COMPOSED or _is_step(eqn) or _is_branched(eqn):
+            return True
+        if variation > STATE | TIME and _is_equality(eqn):
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
-        if any(_may_switch(subjaxpr) for subjaxpr in subjaxprs(eqn)):
+        if any(_may_switch(subjaxpr, variation) for subjaxpr in subjaxprs(eqn)):
             return True
     return False
 
@@ -254,6 +265,22 @@ def _is_step(eqn) -> bool:
     return any(map(_is_float, eqn.invars)) and not any(True for _ in subjaxprs(eqn))
 
 
+def _is_branched(eqn) -> bool:
+    return eqn.primitive.name in _BRANCHED and jnp.issubdtype(
+        eqn.invars[0].aval.dtype, jnp.complexfloating
+    )
+
+
+def _is_equality(eqn) -> bool:
+    """Whether an operation compares floats for equality; ``x != x`` is a test for NaN."""
+    name, variables = eqn.primitive.name, eqn.invars
+    if name not in _CONSTANT and name != "convert_element_type":
+        return False
+    is_nan_test = name in ("eq", "ne") and variables[0] is variables[1]
+    to_bool = eqn.outvars[0].aval.dtype == bool
+    return to_bool and any(map(_is_float, variables)) and not is_nan_test
+
+
 def _to_integer(eqn) -> bool:
     return _is_float(eqn.invars[0]) and _is_integer(eqn.params["new_dtype"])
 
@@ -269,6 +296,8 @@ class _Interpreter:
         self.level_source, self.hidden_operations = level_source, []
         # ``variation``: what the current operation varies with; ``timed``: for each switch
         self.variation, self.timed = 0, []
+        self.kinks: list[range] = []  # the switches of each kink
+        self.jumping: set[int] = set()  # switches of kinks that a later comparison turns into jumps
 
     def jaxpr(self, jaxpr, consts, args):
         env: dict[Any, Any] = {v: (c, 0) for v, c in zip(jaxpr.constvars, consts)}
@@ -286,21 +315,31 @@ class _Interpreter:
         return self.level_of(u, rule, jumps) > 0
 
     def level_of(self, u, rule: _Rule, jumps: bool):
-        self.timed.extend([self.variation == TIME] * jnp.size(u))
+        first = len(self.timed)
+        self.timed.extend([self.variation & (STATE | TIME) == TIME] * jnp.size(u))
+        if not jumps:
+            self.kinks.append(range(first, len(self.timed)))
         return self.level_source.level_of(u, rule, jumps)
+
+    def _mark_jumps(self, variation: int):
+        """A value is compared for equality: the result jumps at the kinks that it depends on."""
+        for k, switches in enumerate(self.kinks):
+            if variation >> (k + 2) & 1:
+                self.jumping.update(switches)
 
     def equation(self, eqn, operands):
         name, x = eqn.primitive.name, [value for value, _ in operands]
         self.variation = variation = reduce(or_, (m for _, m in operands), 0)
         if variation and name in _CALLS and eqn.params.get("name") != SMOOTH:
             for subjaxpr in subjaxprs(eqn):
-                if _may_switch(subjaxpr):
+                if _may_switch(subjaxpr, variation):
                     return self._call(eqn, operands)
-        if variation and name == "scan" and any(map(_may_switch, subjaxprs(eqn))):
+        if variation and name == "scan" and any(_may_switch(j, variation) for j in subjaxprs(eqn)):
             return self._scan(eqn, operands)
         branches = list(subjaxprs(eqn)) if variation and name == "cond" else []
+        switches = any(_may_switch(branch, variation) for branch in branches)
         # a check (``eqx.error_if``) must be evaluated in its own branch only
-        if any(map(_may_switch, branches)) and not any(map(_calls_back, branches)):
+        if switches and not any(map(_calls_back, branches)):
             return self._cond(eqn, operands)
         if variation and name == _COMPOSED:
             return self._expanded(eqn, operands)
@@ -312,9 +351,18 @@ class _Interpreter:
             self.hidden_operations.append(name)
         first_var = next((v for v in eqn.invars if not isinstance(v, Literal)), None)
         if variation and eqn.outvars and first_var is not None and _is_float(first_var):
+            first_kink = len(self.kinks)
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
+                for k in range(first_kink, len(self.kinks)):
+                    variation |= 1 << (k + 2)
                 return [(o, variation if m else 0) for o, m in outputs]
+        if variation and _is_branched(eqn):
+            if name in _CONTINUED:
+                return [(self._continued(eqn, name, x), variation)]
+            self.hidden_operations.append(name)
+        if variation and _is_equality(eqn):
+            self._mark_jumps(variation)
         if variation and _is_step(eqn):
             self.hidden_operations.append(name)
         out = _bind(eqn, x)
@@ -357,15 +405,8 @@ class _Interpreter:
             return [
                 (self._integer_level(x[0], _TRUNC, eqn.invars[0].aval).astype(out.dtype), False)
             ]
-        # On the negative x axis the angle jumps by 2 pi. With the sign of y fixed it continues
-        # smoothly, and the jump becomes a switch.
         if name == "atan2":
-            y, x = x
-            is_upper, two_pi = self.is_nonnegative(y, True), jnp.asarray(2 * np.pi, out.dtype)
-            branch_jump = jnp.where(
-                is_upper & (y < 0), two_pi, jnp.where(~is_upper & (y >= 0), -two_pi, 0)
-            )
-            return [(jnp.arctan2(y, x) + jnp.where(x < 0, branch_jump, 0), True)]
+            return [(jnp.arctan2(*x) + self._branch_jump(*x), True)]
         if name in ("reduce_max", "reduce_min"):
             value, _ = self._extreme(x[0], eqn.params["axes"], name == "reduce_max")
             return [(value, True)]
@@ -402,6 +443,26 @@ class _Interpreter:
         if name in _SORTS:
             self.hidden_operations.append(name)
         return None
+
+    def _branch_jump(self, y, x):
+        """Difference between the continued and the principal angle of (x, y). On the negative x
+        axis the principal angle jumps by 2 pi: with the sign of y fixed the angle continues
+        smoothly, and the jump becomes a switch."""
+        y = jnp.asarray(y)
+        is_upper, two_pi = self.is_nonnegative(y, True), jnp.asarray(2 * np.pi, y.dtype)
+        jump = jnp.where(is_upper & (y < 0), two_pi, jnp.where(~is_upper & (y >= 0), -two_pi, 0))
+        return jnp.where(x < 0, jump, 0)
+
+    def _continued(self, eqn, name, x):
+        """A complex function, continued over the branch cut from the side of the fixed level."""
+        (principal,) = _bind(eqn, x)
+        jump = self._branch_jump(jnp.imag(x[0]), jnp.real(x[0]))
+        if name in ("sqrt", "rsqrt"):
+            return jnp.where(jump == 0, principal, -principal)
+        change = jax.lax.complex(jnp.zeros_like(jump), jump)
+        if name == "log":
+            return principal + change
+        return principal * jnp.exp(change * jnp.asarray(x[1], change.dtype))
 
     def _select_larger(self, a, b, larger: bool):
         """The larger (or the smaller) of two."""
