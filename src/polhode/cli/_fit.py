@@ -271,7 +271,7 @@ def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
         hint = ""
         if "deg/s" in str(error) and not (options.degrees and options.milliseconds):
             hint = " See --degrees and --milliseconds."
-        elif "must have the columns" in str(error):
+        elif "requested columns" in str(error):
             missing = [role for role in _ROLES if f"{role} -> " in str(error)]
             hint = " Name them: --columns " + " ".join(f"{role}=COLUMN" for role in missing)
         first, end, lines = str(error).partition("\n")

@@ -116,8 +116,8 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
     ]
     if missing_columns:
         raise ValueError(
-            f"{path} lacks requested columns: {', '.join(missing_columns)}; its "
-            f"columns are: {', '.join(names) or 'none'}{_headless(names)}."
+            f"{path} does not have the requested columns, missing: {', '.join(missing_columns)};"
+            f" its columns are: {', '.join(names) or 'none'}{_headless(names)}."
         )
     shared = [name for name in header_names.values() if [*header_names.values()].count(name) > 1]
     if shared:
