@@ -429,7 +429,7 @@ def test_what_cannot_be_searched_is_told():
 @pytest.mark.slow
 def test_a_search_that_runs_out_of_steps_is_told():
     few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
-    with pytest.raises(ValueError, match="steps of a body ran out"):
+    with pytest.raises(ValueError, match="a body reached the limit of steps"):
         ph.crossings(few, height(0.0))
 
 
