@@ -20,14 +20,16 @@ from polhode.rotation._quaternion import wxyz_rate
 
 @eqx.filter_jit
 def motion_of_axes(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Rates (T, 3) [rad/s] at which the body axes of one body rotate, and their derivatives.
+    """Angular velocity (T, 3) [rad/s] of the axes of one body, and its derivative by time.
 
-    Those of the samples; the axes of a body with an energy sink slip in addition.
+    It is the body rate, plus the slip of the axes of a body with an energy sink.
     """
     scene, omega, t = trajectory._scene, trajectory.omega_body, trajectory._t
     wxyz = None if trajectory.scene.is_free else trajectory.wxyz
     acceleration, spin_rates = scene.changes(wxyz, omega, t)
     torque = scene.torque
+    if torque is None:
+        return omega, acceleration
     spins = scene.dynamics.wheels.spins if spin_rates else ()
 
     def slip(omega, t, spins):
@@ -35,7 +37,7 @@ def motion_of_axes(trajectory: Trajectory) -> tuple[Array, Array]:
         parts = torque.slip(t, components(momentum), components(omega))
         return None if parts is None else jnp.stack(parts, axis=-1)
 
-    if torque is None or slip(omega, t, spins) is None:
+    if slip(omega, t, spins) is None:
         return omega, acceleration
     tangents = acceleration, jnp.ones_like(t), spin_rates
     value, change = jax.jvp(slip, (omega, t, spins), tangents)
@@ -43,23 +45,23 @@ def motion_of_axes(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 @jax.jit
-def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
+def _rotations_with_derivatives(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
     """Rotation vector of each interval, with its first two derivatives by s = (t - start)/h, at its
     start and its end: two arrays (t-1, 3, 3)."""
     start, end = slice(None, -1), slice(1, None)
     origin = conjugate(wxyz[start])
     rate = wxyz_rate(wxyz, omega_body)
-    bend = wxyz_rate(rate, omega_body) + wxyz_rate(wxyz, angular_acceleration)
+    acceleration = wxyz_rate(rate, omega_body) + wxyz_rate(wxyz, angular_acceleration)
 
     def vector(h):
-        path = wxyz[end] + h * rate[end] + h * h / 2 * bend[end]
+        path = wxyz[end] + h * rate[end] + h * h / 2 * acceleration[end]
         return wxyz_to_rotation_vector(multiply(origin, path))
 
-    def slope(h):
+    def derivative(h):
         return jax.jvp(vector, (h,), (jnp.ones_like(h),))[1]
 
     zero = jnp.zeros((), ts.dtype)
-    first_derivative, second_derivative = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))
+    first_derivative, second_derivative = jax.jvp(derivative, (zero,), (jnp.ones_like(zero),))
     step = (ts[end] - ts[start])[:, None]
     start_values = [
         jnp.zeros_like(first_derivative),
@@ -94,8 +96,8 @@ class SampledAttitude(eqx.Module):
 
     ts: Float[Array, " t"]
     wxyz: Float[Array, "t 4"]
-    start_slope: Float[Array, "t-1 3 3"]
-    end_slope: Float[Array, "t-1 3 3"]
+    interval_starts: Float[Array, "t-1 3 3"]
+    interval_ends: Float[Array, "t-1 3 3"]
 
     def __init__(
         self, ts: ArrayLike, wxyz: ArrayLike, omega_body: ArrayLike, angular_acceleration: ArrayLike
@@ -105,20 +107,20 @@ class SampledAttitude(eqx.Module):
         self.wxyz = as_float_array("wxyz", wxyz, (None, 4))
         rates = as_float_array("omega_body", omega_body, (None, 3))
         acceleration = as_float_array("angular_acceleration", angular_acceleration, (None, 3))
-        slopes = _slopes(self.ts, self.wxyz, rates, acceleration)
-        self.start_slope, self.end_slope = slopes
+        ends = _rotations_with_derivatives(self.ts, self.wxyz, rates, acceleration)
+        self.interval_starts, self.interval_ends = ends
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:
         backwards = self.ts[-1] < self.ts[0]
         times, ascending_time = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
         k = _interval(times, ascending_time)
         s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
-        (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
+        (_, v0, a0), (p1, v1, a1) = self.interval_starts[k], self.interval_ends[k]
         # Taylor polynomial at the start, plus three terms that match value, first and second
         # derivative at the end
-        value, slope, bend = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
-        cubic = 10 * value - 4 * slope + bend / 2
-        quartic = -15 * value + 7 * slope - bend
-        quintic = 6 * value - 3 * slope + bend / 2
+        value, first, second = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
+        cubic = 10 * value - 4 * first + second / 2
+        quartic = -15 * value + 7 * first - second
+        quintic = 6 * value - 3 * first + second / 2
         vector = s * (v0 + s * (a0 / 2 + s * (cubic + s * (quartic + s * quintic))))
         return multiply(self.wxyz[k], rotation_vector_to_wxyz(vector))
