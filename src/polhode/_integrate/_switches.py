@@ -141,7 +141,7 @@ def raising_on_hidden_switches(results: Any, hidden: tuple[str, ...]) -> Any:
         results,
         f"derivatives through {named} in a torque would leave out the times at which its result"
         " jumps. Write it with comparisons, jnp.where, jnp.searchsorted, jnp.argmax or jnp.sort of"
-        " at most 16 numbers: steps end where these turn, and derivatives are right.",
+        " at most 16 numbers: steps end where these change, and derivatives are right.",
     )
 
 
