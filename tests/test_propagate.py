@@ -306,3 +306,5 @@ def test_a_step_that_times_do_not_resolve_is_refused(traced):
         ph.propagate(scene, state, 0.01, t=86400.0)
     with pytest.raises(ValueError, match="one number each"):
         ph.propagate(scene, state, [0.1, 0.2])
+    with pytest.raises(TypeError, match="dt must be"):
+        ph.propagate(scene, state, "0.1")

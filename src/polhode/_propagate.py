@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike, is_concrete, numbers, require
+from polhode._checks import ArrayLike, as_float_array, is_concrete, numbers, require
 from polhode._integrate._field import uses
 from polhode._kernels import jit_distinct
 from polhode._method import (
@@ -121,7 +121,7 @@ def propagate(
             f" {state.wxyz.shape}, {state.omega_body.shape}: map it, jax.vmap(ph.propagate, ...)."
         )
     dtype = state.omega_body.dtype
-    dt, t = _number(dt, dtype), _number(t, dtype)
+    dt, t = _number("dt", dt, dtype), _number("t", t, dtype)
     if dt.ndim or t.ndim:
         raise ValueError(
             f"dt and t are one number each, got shapes {dt.shape}, {t.shape}: for several steps"
@@ -158,10 +158,11 @@ def propagate(
     return Propagation(state, jacobian, noise)
 
 
-def _number(value: Any, dtype: Any) -> Array | np.ndarray:
-    """A number of the dtype, in NumPy where it is known: an operation of JAX takes 50 us."""
-    is_plain = isinstance(value, float | int | np.floating | np.integer)
-    return np.asarray(value, dtype) if is_plain else jnp.asarray(value, dtype)
+def _number(name: str, value: Any, dtype: Any) -> Array | np.ndarray:
+    """``value`` in the dtype; a Python number in NumPy, since an operation of JAX takes 50 us."""
+    if isinstance(value, float | int | np.floating | np.integer):
+        return np.asarray(value, dtype)
+    return as_float_array(name, value, (), finite=False).astype(dtype)
 
 
 def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
