@@ -65,6 +65,14 @@ floats by a library call, which a kernel cannot contain."""
 KERNEL_TABLE = 1024
 """[numbers] Constant arrays up to this size are part of a kernel; larger ones are its operands."""
 
+KERNEL_PRODUCT = 32
+"""[multiplications] Up to this number, a product of matrices in the field is written as a sum, as
+a kernel can contain only sums. Larger ones, as in networks, are one library call for all bodies."""
+
+KERNEL_INDEX = 1024
+"""[entries times results] Up to this number, an update of entries in the field, and the derivative
+of an index, are written as selections, which a kernel can contain."""
+
 STAGE_WORK = 8
 """[operations] An intermediate value of the field that several rates share is staged if it takes
 this many operations or more."""

@@ -21,6 +21,7 @@ from polhode._kernels import (
     formula,
     is_fusible,
     specialise,
+    without_repeats,
 )
 
 TermOf = Callable[[Any], tuple[Any, Any]]
@@ -104,7 +105,7 @@ class Problem(NamedTuple):
         single_lane = [x[0] if lane else x for x, lane in zip(distinct_arrays, flags)]
         dtype = jnp.result_type(*components)
         closed_jaxpr = formula(equations, *single_lane, t, *(jnp.ravel(x)[:1] for x in components))
-        closed_jaxpr, consts = constants_as_operands(closed_jaxpr)
+        closed_jaxpr, consts = constants_as_operands(without_repeats(closed_jaxpr))
         varies = [
             *[0] * (len(closed_jaxpr.jaxpr.invars) - 1 - len(components)),
             TIME,
@@ -146,8 +147,9 @@ class Problem(NamedTuple):
         size, count = self.components, self.switches.count
         if not self.specialised:  # traced once: derivatives call ``motion`` with other arrays
             self.specialised.append(self._specialised())
-        prepared, field, kinds = self.specialised[0]
+        prepared, field, levels_program, kinds = self.specialised[0]
         prepare, run = jaxpr_as_fun(prepared), jaxpr_as_fun(field)
+        run_levels = jaxpr_as_fun(levels_program)
         # If JAX differentiates the loop, arrays are not stacked: a tangent of one of them would
         # become one of the whole stack.
         stacks = _Stacks([(*kind, i) for i, kind in enumerate(kinds)] if differentiable else kinds)
@@ -179,7 +181,7 @@ class Problem(NamedTuple):
             )
 
         def levels_of_one(constants, t, y):
-            return self.switches.levels(*constants, t, *(y[i][None] for i in range(size)))
+            return run_levels(*constants, t, *(y[i][None] for i in range(size)))[0]
 
         def levels(constants, t, y):
             if not count:
@@ -236,19 +238,27 @@ class Problem(NamedTuple):
             return list(specialised.coefficients)
 
         prepared = jax.make_jaxpr(coefficients_of)(*single_lane)
+        levels = formula(self.switches.levels, *single_lane, t, *y)
+
+        def staged_levels(*operands):
+            specialised = specialise(levels, [])  # only stages the values that levels share
+            return specialised.run(specialised.coefficients, *operands)
+
+        levels_program = jax.make_jaxpr(staged_levels)(*single_lane, t, *y)
         depends = dependent_results(prepared.jaxpr, self.lanes)
         kinds = [(is_lane, x.shape, x.dtype) for is_lane, x in zip(depends, prepared.out_avals)]
-        return _Specialised(prepared, fields[0], kinds)
+        return _Specialised(prepared, fields[0], levels_program, kinds)
 
 
 class _Specialised(NamedTuple):
     """``prepared``: from the arrays of one body to the coefficients, which are constant during the
     motion; ``field``: from the coefficients, levels, time and state to rates, margins and new
-    levels; ``kinds``: for each coefficient, whether it differs between bodies, its shape and
-    dtype."""
+    levels; ``levels``: from the arrays of one body, time and state to the levels; ``kinds``: for
+    each coefficient, whether it differs between bodies, its shape and dtype."""
 
     prepared: ClosedJaxpr
     field: ClosedJaxpr
+    levels: ClosedJaxpr
     kinds: list[tuple]
 
 

@@ -44,4 +44,5 @@ from polhode._kernels._programs import (
     constants_as_operands as constants_as_operands,
     dependent_results as dependent_results,
     subjaxprs as subjaxprs,
+    without_repeats as without_repeats,
 )

@@ -21,7 +21,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
 
 from polhode import _policy
-from polhode._kernels._programs import binder
+from polhode._kernels._programs import binder, fusible_binder, operation_key, update_form
 
 # Staging: values that XLA computes once, and not again in every loop that uses them.
 
@@ -190,13 +190,17 @@ class Specialised(NamedTuple):
 
 class _LoopOperation(NamedTuple):
     """An operation of the loop. ``operands``: for each the number of a loop value or a
-    ``_Constant``, its aval, and the shape to which it is broadcast. ``by_entry``: whether it acts
-    on each entry separately."""
+    ``_Constant``, its aval, and the shape to which it is broadcast."""
 
     outputs: list[int]
     bind: Any
-    by_entry: bool
+    name: str
     operands: list[tuple[Any, Any, tuple[int, ...]]]
+
+    @property
+    def by_entry(self) -> bool:
+        """Whether it acts on each entry separately."""
+        return self.name in _BY_ENTRY
 
 
 def specialise(
@@ -295,9 +299,15 @@ def _shared(operations: Sequence[_LoopOperation], outputs) -> frozenset[int]:
     def loop_inputs(operands):
         return {i for i, *_ in operands if not isinstance(i, _Constant) and i in producers}
 
+    # XLA computes each operand of a concatenation in a loop of its own: each is a result
+    results = []
+    for operand in outputs:
+        producer = operations[producers[operand[0]]] if loop_inputs([operand]) else None
+        concatenated = producer is not None and producer.name == "concatenate"
+        results += producer.operands if concatenated else [operand]
     use_counts = dict.fromkeys(producers, 0)
     dependent_results: dict[int, set[int]] = {i: set() for i in producers}
-    for k, operand in enumerate(outputs):
+    for k, operand in enumerate(results):
         for i in loop_inputs([operand]):
             use_counts[i] += 1
             dependent_results[i].add(k)
@@ -373,7 +383,7 @@ class _PartialEvaluator:
         def append_operation():
             loop_values = [self.new_loop_value(aval) for aval in outs]
             self.operations.append(
-                _LoopOperation([s.index for s in loop_values], bind, name in _BY_ENTRY, operands)
+                _LoopOperation([s.index for s in loop_values], bind, name, operands)
             )
             return loop_values
 
@@ -430,7 +440,7 @@ class _PartialEvaluator:
             numbers = all(x.number is not None for x in operands)
             if self.fold or numbers or name in _REARRANGEMENTS:
                 avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-                key = _shaped(_operation(eqn), avals)
+                key = _shaped(operation_key(eqn), avals)
                 return self.cached(
                     key, operands, outs, lambda: self.evaluate_equation(eqn, operands)
                 )
@@ -439,7 +449,14 @@ class _PartialEvaluator:
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        return self.emit(binder(eqn), operands, avals, outs, _operation(eqn), name)
+        bind = fusible_binder(eqn)
+        if name.startswith("scatter") and isinstance(operands[1], _Constant):
+            update = update_form(eqn, jnp.broadcast_to(operands[1].value, avals[1].shape))
+            if update is not None:
+                bind, places = update
+                operands = [operands[0], _Constant(places), operands[2]]
+                avals[1] = ShapedArray(places.shape, places.dtype)
+        return self.emit(bind, operands, avals, outs, operation_key(eqn), name)
 
     def evaluate_equation(self, eqn, operands) -> list[_Constant]:
         """The results of an equation that does not depend on the state, as numbers if possible."""
@@ -560,14 +577,3 @@ _NUMPY_NAMES = {"add": "add", "sub": "subtract", "mul": "multiply"}
 def _key_of(x: _Constant) -> Any:
     """The identity of an array, or the bits of a number: 0.0 and -0.0 are different keys."""
     return id(x.value) if x.number is None else (x.number.dtype, x.number.tobytes())
-
-
-def _operation(eqn) -> Any:
-    """A key that equal operations share, operands not included; None if the operation has effects
-    or its parameters cannot be hashed."""
-    key = (eqn.primitive.name, *sorted(eqn.params.items()))
-    try:
-        hash(key)
-    except TypeError:
-        return None
-    return None if eqn.effects else key

@@ -76,10 +76,13 @@ def _quaternion_of_matrix(matrix: Array, good: Array) -> Array:
         [c - g, b + d, 1 - a + e - i, f + h],
         [d - b, c + g, f + h, 1 - a - e + i],
     ]
-    rows = jnp.stack([jnp.stack(row, axis=-1) for row in outer], axis=-2)
-    diagonal = jnp.stack([outer[k][k] for k in range(4)], axis=-1)
-    largest = jnp.argmax(diagonal, axis=-1)[..., None, None]
-    row = jnp.take_along_axis(rows, largest, axis=-2)[..., 0, :]
+    # The row with the largest diagonal entry, by comparisons: an index would make the cotangent a
+    # scatter, which a fused kernel cannot contain.
+    row, largest = jnp.stack(outer[0], axis=-1), outer[0][0]
+    for k in range(1, 4):
+        is_larger = outer[k][k] > largest
+        row = jnp.where(is_larger[..., None], jnp.stack(outer[k], axis=-1), row)
+        largest = jnp.where(is_larger, outer[k][k], largest)
     unit = canonical(row / jnp.sqrt(jnp.sum(row * row, axis=-1, keepdims=True)))
     return jnp.where(good[..., None], unit, jnp.nan)
 
