@@ -23,11 +23,6 @@ def free(moments=MOMENTS):
     return ph.Scene(ph.Inertia.from_moments(moments))
 
 
-def one_by_one(scene_of, n, **kwargs):
-    runs = [ph.simulate(*scene_of(i), TS, METHOD, rtol=1e-12, **kwargs) for i in range(n)]
-    return jnp.stack([r.wxyz for r in runs]), jnp.stack([r.omega_body for r in runs])
-
-
 @pytest.mark.slow  # faster: chunks and vmap, below
 def test_batch_equals_single_bodies_in_any_shape():
     """Leaves (3, 1, 3) of inertia, (2, 4) of attitude and (3,) of gravity: 3 x 2 bodies."""
