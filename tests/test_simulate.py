@@ -264,18 +264,6 @@ def test_to_xarray_names_dimensions_and_units():
     assert set(alone.data_vars) == {"wxyz", "status"}
 
 
-def test_import_has_no_side_effects():
-    import subprocess
-    import sys
-
-    code = (
-        "import jax; before = dict(jax.config.values); import polhode;"
-        "assert before == dict(jax.config.values); assert not jax.config.jax_enable_x64;"
-        "import sys; assert 'matplotlib' not in sys.modules and 'xarray' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 _MOMENTS = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 
 
