@@ -332,10 +332,10 @@ def with_weight(
             return [jnp.zeros_like(x) for x in values]
         force, *others, elapsed, q, applies = operands
 
-        def changes(force):
+        def by_force(force):
             return _first_order(Top(others[0], force, *others[1:]), elapsed, q, applies)
 
-        return jax.jvp(changes, (force,), (tangents[0],))[1]
+        return jax.jvp(by_force, (force,), (tangents[0],))[1]
 
     others = top._replace(force=None)
     operands = [top.force, *jax.tree.leaves(others), elapsed, motion[0], applies]
