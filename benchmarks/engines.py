@@ -23,6 +23,7 @@ if __name__ == "__main__":
 
 import jax
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import polhode as ph
 
@@ -136,14 +137,8 @@ def engines() -> dict[str, tuple[str, Run]]:
 
 
 def matrix(wxyz: np.ndarray) -> np.ndarray:
-    w, x, y, z = wxyz / np.linalg.norm(wxyz)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """Rotation matrix, body -> space."""
+    return Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
 
 
 def exact(body: dict, saves: list[int]) -> np.ndarray:

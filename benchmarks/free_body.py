@@ -10,9 +10,9 @@ core.
 """
 
 import argparse
+import dataclasses
 import hashlib
 import json
-import statistics
 import sys
 import time
 from pathlib import Path
@@ -26,6 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.peers import rigid_body
+from benchmarks.problems import PROBLEMS
 from polhode._closed_forms import free_motion
 
 jax.config.update("jax_enable_x64", True)
@@ -111,23 +113,12 @@ def compiled(fn, *given):
     return program, time.process_time() - begin
 
 
-def timed(fn, repeats: int = 30) -> tuple[float, float]:
-    """Minimum and median seconds of one call."""
-    fn()
-    spans = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        fn()
-        spans.append(time.perf_counter() - begin)
-    return min(spans), statistics.median(spans)
-
-
 def final_state(case: str, count: int, t: float, scored: int) -> dict:
     q, w = bodies(case, count)
     moments = components(np.broadcast_to(np.array(CASES[case]), (count, 3)))
     given = moments, components(q), components(w), jnp.full(count, t)
     program, compile_s = compiled(free_motion, *given)
-    least, median = timed(lambda: jax.block_until_ready(program(*given)))
+    timing = _report.clock(lambda: jax.block_until_ready(program(*given)), repeats=30)
     omega, wxyz = program(*given)
     exact = truth(case, scored, t)
     return {
@@ -136,8 +127,8 @@ def final_state(case: str, count: int, t: float, scored: int) -> dict:
         "bodies": count,
         "t": t,
         "compile_s": compile_s,
-        "ns_per_body": least / count * 1e9,
-        "ns_per_body_median": median / count * 1e9,
+        "ns_per_body": timing.least / count * 1e9,
+        "ns_per_body_median": timing.median / count * 1e9,
         "scored": scored,
         **score(omega, wxyz, exact),
     }
@@ -157,8 +148,8 @@ def saved_times(count: int, times: int) -> dict:
             t,
         )
         given = moments, components(q), components(w), t
-        least, _ = timed(lambda p=program, g=given: jax.block_until_ready(p(*g)), 15)
-        row[f"ns_per_state_{name}"] = least / count / times * 1e9
+        timing = _report.clock(lambda p=program, g=given: jax.block_until_ready(p(*g)), repeats=15)
+        row[f"ns_per_state_{name}"] = timing.least / count / times * 1e9
     return row
 
 
@@ -166,8 +157,8 @@ def latency() -> dict:
     q, w = bodies("A", 1)
     given = jnp.array([CASES["A"]]), jnp.asarray(q), jnp.asarray(w), jnp.array([100.0])
     call = jax.jit(free_motion)
-    least, median = timed(lambda: jax.block_until_ready(call(*given)), 500)
-    return {"us_per_call": least * 1e6, "us_per_call_median": median * 1e6}
+    timing = _report.clock(lambda: jax.block_until_ready(call(*given)), repeats=30)
+    return {"us_per_call": timing.least * 1e6, "us_per_call_median": timing.median * 1e6}
 
 
 def gradient(count: int, t: float = 100.0) -> dict:
@@ -191,8 +182,11 @@ def gradient(count: int, t: float = 100.0) -> dict:
     moments = components(np.broadcast_to(np.array(CASES["A"]), (count, 3)))
     forward, compile_forward = compiled(loss, moments)
     backward, compile_backward = compiled(jax.value_and_grad(loss), moments)
-    value, _ = timed(lambda: jax.block_until_ready(forward(moments)))
-    both, _ = timed(lambda: jax.block_until_ready(backward(moments)))
+    calls = {
+        "value": lambda: jax.block_until_ready(forward(moments)),
+        "both": lambda: jax.block_until_ready(backward(moments)),
+    }
+    value, both = (x.least for x in _report.in_turn(calls, repeats=30).values())
     row = {
         "bodies": count,
         "t": t,
@@ -220,17 +214,9 @@ def heyoka_final(case: str, count: int, t: float, tolerance: float) -> dict | No
         import heyoka as hy
     except ImportError:
         return None
-    q0, q1, q2, q3, x, y, z = hy.make_vars("q0", "q1", "q2", "q3", "x", "y", "z")
-    a, b, c = CASES[case]
-    system = [
-        (q0, -0.5 * (q1 * x + q2 * y + q3 * z)),
-        (q1, 0.5 * (q0 * x + q2 * z - q3 * y)),
-        (q2, 0.5 * (q0 * y + q3 * x - q1 * z)),
-        (q3, 0.5 * (q0 * z + q1 * y - q2 * x)),
-        (x, (b - c) / a * y * z),
-        (y, (c - a) / b * z * x),
-        (z, (a - b) / c * x * y),
-    ]
+    names = hy.make_vars("q0", "q1", "q2", "q3", "x", "y", "z")
+    body = dataclasses.replace(PROBLEMS["free"], moments=CASES[case])
+    system = list(zip(names, rigid_body(body, names[:4], names[4:], 0 * names[0])))
     q, w = bodies(case, count)
     states = np.concatenate([q, w], 1)
     lanes = 8
@@ -245,9 +231,9 @@ def heyoka_final(case: str, count: int, t: float, tolerance: float) -> dict | No
             integrator.propagate_until(t)
             found[n : n + lanes] = integrator.state.T
 
-    least, _ = timed(run, 10)
+    timing = _report.clock(run, repeats=10)
     row = {"case": case, "bodies": count, "t": t, "tolerance": tolerance}
-    row["ns_per_body"] = least / count * 1e9
+    row["ns_per_body"] = timing.least / count * 1e9
     return row | score(found[:, 4:].T, found[:, :4].T, truth(case, min(count, 20), t))
 
 

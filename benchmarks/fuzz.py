@@ -44,6 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
+from benchmarks._formulas import multiply
 from benchmarks.fuzz_parts import PARTS, ZERO, Moment, Part, Scale, fits
 from benchmarks.fuzz_truth import (
     Failure,
@@ -51,7 +52,6 @@ from benchmarks.fuzz_truth import (
     cross,
     dot,
     matrix,
-    multiply,
     norm,
     scaled,
     total,

@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
+from benchmarks._formulas import multiply
 from benchmarks.fuzz_truth import (
     anomaly,
     cross,
     dot,
     matrix,
-    multiply,
     norm,
     scaled,
     to_body,
@@ -334,9 +334,10 @@ class UserPotential(Part):
 class _Sine(eqx.Module):
     size: Any
     rate: Any
+    phase: float = eqx.field(static=True, default=0.0)
 
     def __call__(self, t):
-        return self.size * jnp.sin(self.rate * t + 0.3)
+        return self.size * jnp.sin(self.rate * t + self.phase)
 
 
 class BodyConstant(Part):
@@ -359,7 +360,7 @@ class BodySine(Part):
         return {"n": s.torque() * s.direction(), "f": s.rate * s.decades(-1, 1)}
 
     def build(self, n):
-        return {"torque": ph.BodyTorque(_Sine(jnp.asarray(n["n"]), jnp.asarray(n["f"])))}
+        return {"torque": ph.BodyTorque(_Sine(jnp.asarray(n["n"]), jnp.asarray(n["f"]), 0.3))}
 
     def torque(self, n, m, levels):
         return scaled(math.sin(n["f"] * m.t + 0.3), n["n"])
@@ -379,7 +380,7 @@ class SpaceSine(BodySine):
     name = "SpaceTorque of time"
 
     def build(self, n):
-        return {"torque": ph.SpaceTorque(_Sine(jnp.asarray(n["n"]), jnp.asarray(n["f"])))}
+        return {"torque": ph.SpaceTorque(_Sine(jnp.asarray(n["n"]), jnp.asarray(n["f"]), 0.3))}
 
     def torque(self, n, m, levels):
         return to_body(m.rows, super().torque(n, m, levels))
@@ -959,14 +960,6 @@ class Driven(Part):
         return [Wheel(_unit(n["axis"]), n["J"], n["speed"], lambda m, w, ws, levels: n["torque"])]
 
 
-class _Impulse(eqx.Module):
-    size: Any
-    rate: Any
-
-    def __call__(self, t):
-        return self.size * jnp.sin(self.rate * t)
-
-
 class Impulse(Part):
     name, gain, batched = "Rotor, impulse", "size", False
 
@@ -976,7 +969,7 @@ class Impulse(Part):
         return found | {"size": size, "f": s.rate * s.decades(-1, 0)}
 
     def build(self, n):
-        law = _Impulse(jnp.asarray(n["size"]), jnp.asarray(n["f"]))
+        law = _Sine(jnp.asarray(n["size"]), jnp.asarray(n["f"]))
         return {"rotors": ph.Rotor(n["axis"], n["J"], speed=n["speed"], impulse=law)}
 
     def wheels(self, n):
@@ -1194,14 +1187,6 @@ class Dumping(Part):
         return [Wheel(_unit(n["axis"]), n["J"], n["speed"], lambda m, w, ws, levels: 0.0)]
 
 
-class _Angle(eqx.Module):
-    size: Any
-    rate: Any
-
-    def __call__(self, t):
-        return self.size * jnp.sin(self.rate * t)
-
-
 class Gyro(Part):
     name, gain, batched = "ControlMomentGyro", "h", False
 
@@ -1219,7 +1204,7 @@ class Gyro(Part):
         }
 
     def build(self, n):
-        law = _Angle(jnp.asarray(n["size"]), jnp.asarray(n["f"]))
+        law = _Sine(jnp.asarray(n["size"]), jnp.asarray(n["f"]))
         return {"torque": ph.ControlMomentGyro(n["h"], n["gimbal"], n["spin"], law)}
 
     def torque(self, n, m, levels):

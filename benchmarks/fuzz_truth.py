@@ -209,12 +209,6 @@ def norm(a: Vector) -> float:
     return math.sqrt(dot(a, a))
 
 
-def multiply(p: Vector, q: Vector) -> tuple[float, float, float, float]:
-    """Product of quaternions w + x i + y j + z k."""
-    vector = total(scaled(p[0], q[1:]), scaled(q[0], p[1:]), cross(p[1:], q[1:]))
-    return (p[0] * q[0] - dot(p[1:], q[1:]), *vector)
-
-
 def matrix(q: Vector) -> tuple[tuple[float, float, float], ...]:
     """Rows of R, body -> space, of a unit quaternion."""
     w, x, y, z = q

@@ -26,8 +26,8 @@ import numpy as np
 
 import polhode as ph
 from benchmarks import truth
-from benchmarks.peers import rigid_body
-from benchmarks.problems import DIRECTION, PROBLEMS, Problem
+from benchmarks.peers import polhode_own, rigid_body
+from benchmarks.problems import PROBLEMS, Problem
 
 WEIGHTS = (0.7, -0.4, 0.9, 0.3, -0.5, 0.8, 0.6)
 HORIZON = 20.0
@@ -64,22 +64,14 @@ def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
     record = ph.Record(final_only=True)
     symmetric = problem.moments[0] == problem.moments[1]
 
+    acting = polhode_own.scene(problem, float)
+
     def scene(moments):
         if symmetric:
             inertia = ph.Inertia.axisymmetric(moments[:, 0], moments[:, 1])
         else:
             inertia = ph.Inertia.from_moments(moments)
-        potential = None
-        if problem.weight:
-            gravity = jnp.array([0.0, 0.0, -problem.weight])
-            potential = ph.UniformGravity.axial(jnp.ones(()), jnp.ones(()), gravity)
-        if problem.gradient:
-            mu = jnp.asarray(problem.gradient / 3)
-            potential = ph.GravityGradient(mu, jnp.asarray(DIRECTION))
-        torque = None
-        if problem.damping:
-            torque = ph.LinearDamping(problem.damping) + ph.BodyTorque(jnp.asarray(problem.push))
-        return ph.Scene(inertia, potential, torque)
+        return ph.Scene(inertia, acting.potential, acting.torque)
 
     moments = np.array(problem.moments)[[0, 2]] if symmetric else np.array(problem.moments)
     moments = jnp.asarray(np.broadcast_to(moments, (n, len(moments))))

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence as Seq
 
 import mpmath as mp
 
+from benchmarks._formulas import multiply
+
 DIGITS = 120
 mp.mp.dps = DIGITS
 Vector = list
@@ -16,17 +18,6 @@ Vector = list
 def exact(values: Seq[float]) -> Vector:
     """Floating-point numbers as mpmath numbers, without rounding."""
     return [mp.mpf(float(value)) for value in values]
-
-
-def multiply(left: Vector, right: Vector) -> Vector:
-    a, b, c, d = left
-    w, x, y, z = right
-    return [
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    ]
 
 
 def norm(values: Vector) -> mp.mpf:

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks._steps import runge_kutta
+from benchmarks._formulas import runge_kutta
 from benchmarks.throws import Instrument, fit_balance
 from polhode import fit as room
 

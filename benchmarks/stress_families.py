@@ -5,7 +5,7 @@ same reference applies to both precisions (``fits_single``).
 """
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import mpmath as mp
 import numpy as np
@@ -66,9 +66,6 @@ class Body:
         inertia = [c * u for c, u in zip(INERTIA_MOVE, units, strict=False)]
         rest = [*START_MOVE[: len(self.start)], *(c * size for c in RATES_MOVE)]
         return [inertia + [0.0] * (len(rest) + 1), [*zero, *rest, TIME_MOVE * self.t]]
-
-    def as_dict(self) -> dict:
-        return asdict(self)
 
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))

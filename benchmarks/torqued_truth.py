@@ -14,6 +14,7 @@ from functools import cache
 import numpy as np
 
 from benchmarks import _report
+from benchmarks._formulas import multiply
 
 LONG = np.longdouble
 HORIZONS = (0.25, 16.0, 128.0, 1000.0)
@@ -212,7 +213,8 @@ def _make(name: str) -> dict[str, np.ndarray]:
         early = np.sqrt(np.mean(sizes[: kept[1]] ** 2))
         size = LONG(2) ** -44
         tilt = size / 2 * np.array([0.6, 0.64, 0.48], LONG)
-        near = np.asarray(q, LONG) + _product(q, (0, *tilt))
+        unit = np.asarray(q, LONG) / np.linalg.norm(q)
+        near = np.asarray(q, LONG) + np.array(multiply(unit, (LONG(0), *tilt)))
         push = np.asarray(w, LONG) + size * early * np.array([-0.64, 0.48, 0.6], LONG)
         moved = motion(name, i, near, push, np.array(HORIZONS))
         apart = 2 * np.linalg.norm(moved[:, :4] - path[kept, :4], axis=1) / size
@@ -220,19 +222,6 @@ def _make(name: str) -> dict[str, np.ndarray]:
         out["growth"].append(np.asarray(apart / turned, float))
         out["turned"].append(np.asarray(turned, float))
     return {key: np.array(value) for key, value in out.items()}
-
-
-def _product(p, q) -> np.ndarray:
-    a, b, c, d = np.asarray(p, LONG) / np.linalg.norm(p)
-    w, x, y, z = np.asarray(q, LONG)
-    return np.array(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ]
-    )
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks._formulas import multiply
 from benchmarks.problems import DIRECTION, PROBLEMS, SATELLITE, Problem
 
 FOLDER = Path(__file__).with_name("truth")
@@ -207,11 +208,11 @@ def _long(moments, q, w, t, digits):
     if max(abs(a - b) for a, b in zip(once[4:7], w)) > mp.mpf(10) ** (4 - digits):
         raise ArithmeticError("the rates did not return after one period")
     # each period multiplies the attitude by the same rotation in space
-    turn = _multiply(once[:4], [q[0], -q[1], -q[2], -q[3]])
+    turn = multiply(once[:4], [q[0], -q[1], -q[2], -q[3]])
     half = mp.atan2(mp.sqrt(mp.fdot(turn[1:], turn[1:])), turn[0])
     axis = [x / mp.sqrt(mp.fdot(turn[1:], turn[1:])) for x in turn[1:]]
     whole = [mp.cos(count * half), *(mp.sin(count * half) * x for x in axis)]
-    return body.advance([*_multiply(whole, q), *w, *zero], t - count * period)[:7]
+    return body.advance([*multiply(whole, q), *w, *zero], t - count * period)[:7]
 
 
 def _period(moments, w):
@@ -227,17 +228,6 @@ def _period(moments, w):
     first, second = (b - a) * high, (c - b) * low
     parameter = min(first, second) / max(first, second)
     return 4 * mp.ellipk(parameter) * mp.sqrt(a * b * c / max(first, second))
-
-
-def _multiply(p, q):
-    a, b, c, d = p
-    w, x, y, z = q
-    return [
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    ]
 
 
 @cache

@@ -480,7 +480,7 @@ MUTANTS = (
         "bracket = kernel(_update)(bracket, jnp.where(is_turning, derivatives, values), values)",
         "bracket = kernel(_update)(bracket, values, values)",
         "turning points between two samples are not found",
-        ("test_events.py::test_a_motion_in_closed_form_stops_at_its_first_event",),
+        ("test_events.py::test_bodies_that_go_either_way_stop_each_at_its_first_event",),
     ),
     Mutant(
         "fit/_solve.py",

@@ -190,7 +190,6 @@ PRIVATE_IMPORTS = {
     "error_control.py": "one step of the extrapolated midpoint rule",
     "free_body.py": "the solution of the free body without lanes and planner",
     "identification.py": "the start of a fit, which a peer is given as well",
-    "integrators.py": "the error control of a bare call of diffrax",
     "light_curves.py": "parts of the search for spin states",
     "policy.py": "the rows of the policy",
     "scale.py": "one block of an ensemble",

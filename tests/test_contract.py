@@ -52,7 +52,11 @@ def test_a_fresh_process_finds_the_names(call):
 
 
 FREE = """
-import sys, polhode as ph
+import sys, jax
+before = dict(jax.config.values)
+import polhode as ph
+assert before == dict(jax.config.values)
+assert not jax.config.jax_enable_x64
 scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
 ph.simulate(scene, ph.State([1, 0, 0, 0], [0.1, 1.0, 0.1]), [0.0, 1.0])
 ph.crossings, ph.propagate, ph.Trajectory
@@ -66,6 +70,7 @@ print("diffrax" in sys.modules)
 
 
 def test_a_free_body_loads_no_integrator_control_law_or_application():
+    """And the import changes no setting of JAX."""
     result = subprocess.run([sys.executable, "-c", FREE], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr[-2000:]
     assert result.stdout.split("\n")[:2] == ["[]", "True"]

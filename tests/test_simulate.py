@@ -23,11 +23,6 @@ def free(moments=MOMENTS):
     return ph.Scene(ph.Inertia.from_moments(moments))
 
 
-def one_by_one(scene_of, n, **kwargs):
-    runs = [ph.simulate(*scene_of(i), TS, METHOD, rtol=1e-12, **kwargs) for i in range(n)]
-    return jnp.stack([r.wxyz for r in runs]), jnp.stack([r.omega_body for r in runs])
-
-
 @pytest.mark.slow  # faster: chunks and vmap, below
 def test_batch_equals_single_bodies_in_any_shape():
     """Leaves (3, 1, 3) of inertia, (2, 4) of attitude and (3,) of gravity: 3 x 2 bodies."""
@@ -267,18 +262,6 @@ def test_to_xarray_names_dimensions_and_units():
     assert "body -> space" in data.attrs["convention"]
     alone = ph.simulate(free(), STATE, TS, record=ph.Record(rates=False)).to_xarray()
     assert set(alone.data_vars) == {"wxyz", "status"}
-
-
-def test_import_has_no_side_effects():
-    import subprocess
-    import sys
-
-    code = (
-        "import jax; before = dict(jax.config.values); import polhode;"
-        "assert before == dict(jax.config.values); assert not jax.config.jax_enable_x64;"
-        "import sys; assert 'matplotlib' not in sys.modules and 'xarray' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 _MOMENTS = ph.Inertia.from_moments([1.0, 1.5, 2.0])

@@ -8,6 +8,7 @@ section 69.
 import numpy as np
 from scipy.special import ellipj, ellipk, ellipkinc, elliprf, elliprj
 
+from benchmarks._formulas import multiply
 from benchmarks.peers import Program
 from benchmarks.problems import Problem
 
@@ -105,14 +106,4 @@ def _attitude(phi, la, lb, lc):
 
 
 def _multiply(p, q):
-    a, b, c, d = (p[..., k] for k in range(4))
-    w, x, y, z = (q[..., k] for k in range(4))
-    return np.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        axis=-1,
-    )
+    return np.stack(multiply(np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)), axis=-1)

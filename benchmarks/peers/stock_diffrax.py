@@ -62,7 +62,7 @@ def _rows(label, layout, problem, start, times, tolerances, chart):
             ys = [jax.block_until_ready(program(body, times, tolerance)) for body in bodies]
         else:
             ys = jax.block_until_ready(program(start, times, tolerance))
-        return _finish(problem, np.asarray(ys), chart)
+        return _finish(np.asarray(ys), chart)
 
     bodies = list(start)
 
@@ -72,7 +72,7 @@ def _rows(label, layout, problem, start, times, tolerances, chart):
     ]
 
 
-def _finish(problem, ys, chart):
+def _finish(ys, chart):
     if chart == "quat":
         return ys[..., :4], ys[..., 4:]
     phi, theta, psi = (ys[..., k] for k in range(3))

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -46,14 +45,6 @@ def on_host(array: Any, weak: bool = False) -> Any:
     if not isinstance(array, jax.Array) or not is_concrete(array) or array.committed:
         return array
     return np.asarray(array) if weak or not array.weak_type else array
-
-
-def together(conditions: Sequence[Any]) -> Any:
-    """Where all of these conditions (...) hold, with batch axes broadcast; None without any."""
-    if not conditions:
-        return None
-    xp = numbers(*conditions)
-    return reduce(xp.logical_and, xp.broadcast_arrays(*conditions))
 
 
 def _is_here(x: Any) -> bool:

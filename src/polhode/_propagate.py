@@ -205,10 +205,7 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     is_resolved = jnp.abs((t + dt) - t - dt) <= _ROUNDED * jnp.abs(dt)
     time_range = jnp.stack([t, t + dt])
     # A closed form does not permit a torque: its effect is integrated over the step.
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    nodes = ((1 + nodes) / 2 + np.arange(parts)[:, None]).reshape(-1) / parts
-    weights = np.tile(weights / 2, parts) / parts
-    nodes, weights = jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
+    nodes, weights = _gauss_points(parts, dtype)
     node_times = t + dt * nodes if method.exact else time_range[:0]
     ts = jnp.concatenate([time_range[:1], node_times, time_range[1:]])
 
@@ -245,15 +242,7 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     derivatives, (*end_samples, wxyz, status, good, turned) = jax.jacfwd(
         lambda inputs: states_after(inputs[:n], inputs[n:]), has_aux=True
     )(jnp.concatenate(zeros))
-    turns, *rates = derivatives  # (T, 4, n + 3), (T, 3, n + 3), (T, w, n + 3)
-    turns = jnp.moveaxis(turns, -1, -2)
-    back = jnp.broadcast_to(rotation.conjugate(wxyz)[:, None], turns.shape)
-    angles = 2 * rotation.multiply(back, turns)[..., 1:]
-    flow = jnp.concatenate([jnp.moveaxis(angles, -1, -2), *rates], axis=-2)
-    parameter_rows = jnp.eye(n, n + 3, dtype=dtype)[begin:]
-    flow = jnp.concatenate(
-        [flow, jnp.broadcast_to(parameter_rows, (ts.size, *parameter_rows.shape))], axis=-2
-    )
+    flow = _tangents(derivatives, wxyz, n)
     end, noise = flow[-1, :, :n], flow[-1, :, n:]
     if method.exact:
         inverse = initial_scene.carrier.rates(jnp.eye(3, dtype=dtype))  # symmetric
@@ -272,6 +261,27 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     wxyz, omega, speeds = end_samples
     state = State.of_samples(wxyz, omega, speeds if loose else None)
     return state, end, noise, status, turned, is_resolved
+
+
+def _gauss_points(parts: int, dtype: Any) -> tuple[Array, Array]:
+    """Gauss points of all ``parts`` of a step, as fractions of the step, and their weights."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes = ((1 + nodes) / 2 + np.arange(parts)[:, None]).reshape(-1) / parts
+    weights = np.tile(weights / 2, parts) / parts
+    return jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
+
+
+def _tangents(derivatives: tuple[Array, ...], wxyz: Array, n: int) -> Array:
+    """Derivatives (T, n, n + 3) of the tangent coordinates, from those of attitude (T, 4, n + 3),
+    rates (T, 3, n + 3) and speeds (T, w, n + 3); the parameters do not change."""
+    turns, *rates = derivatives
+    turns = jnp.moveaxis(turns, -1, -2)
+    back = jnp.broadcast_to(rotation.conjugate(wxyz)[:, None], turns.shape)
+    angles = 2 * rotation.multiply(back, turns)[..., 1:]
+    flow = jnp.concatenate([jnp.moveaxis(angles, -1, -2), *rates], axis=-2)
+    parameter_rows = jnp.eye(n, n + 3, dtype=flow.dtype)[flow.shape[-2] :]
+    rows = jnp.broadcast_to(parameter_rows, (len(wxyz), *parameter_rows.shape))
+    return jnp.concatenate([flow, rows], axis=-2)
 
 
 def _speeds(wheels: Wheels, t: Array, omega: Array) -> Array:

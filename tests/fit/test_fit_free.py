@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
+from benchmarks.identification import bodies, entries, tumble
 from polhode.fit import (
     Finding,
     FitOptions,
@@ -23,28 +23,9 @@ BODIES, SAMPLES = 200, 80
 SIGMA = np.where(np.arange(BODIES) % 2 == 0, 0.01, 0.05)
 
 
-def tumble(tensors, starts, times):
-    """Rates (n, t, 3) of free bodies by DOP853: independent of the package."""
-    inverse = np.linalg.inv(tensors)
-
-    def field(_, flat):
-        w = flat.reshape(-1, 3)
-        spin = np.einsum("nij,nj->ni", tensors, w)
-        return np.einsum("nij,nj->ni", inverse, np.cross(spin, w)).ravel()
-
-    path = solve_ivp(field, times[[0, -1]], starts.ravel(), "DOP853", times, rtol=1e-11, atol=1e-11)
-    return np.moveaxis(path.y.reshape(-1, 3, len(times)), -1, 1)
-
-
 @pytest.fixture(scope="module")
 def cases():
-    rng = np.random.default_rng(11)
-    sigma = rng.uniform(0.2, 1.0, (BODIES, 3))
-    axes = np.linalg.qr(rng.normal(size=(BODIES, 3, 3)))[0]
-    second = np.einsum("nij,nj,nkj->nik", axes, sigma, axes)
-    tensors = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-    starts = rng.normal(size=(BODIES, 3)) * 2
-    starts *= (6 / np.linalg.norm(starts, axis=-1))[:, None]
+    rng, tensors, starts = bodies(11, BODIES, 0.2)
     times = 3.0 + np.sort(rng.uniform(0, 4, SAMPLES))
     clean = tumble(tensors, starts, times)
     noisy = clean + SIGMA[:, None, None] * rng.normal(size=clean.shape)
@@ -125,12 +106,6 @@ def test_errors_of_moments_that_are_nearly_equal_are_larger_than_their_covarianc
     np.testing.assert_allclose(found, fits.ratios[body][:2], rtol=1e-9)
     assert np.all(fits.ratios_std[body][:2] >= 0.999 * linear)
     assert np.max(fits.ratios_std[body][:2] / linear) > 1.01
-
-
-def entries(tensors):
-    return np.stack(
-        [tensors[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], axis=-1
-    )
 
 
 def test_a_level_is_a_probability(fits):

@@ -19,6 +19,13 @@ BOUNDS = {"float64": (5e-15, 5e-15, 1e-13), "float32": (2e-6, 2e-6, 3e-5)}
 
 
 MOTION = jax.jit(free_motion)
+BODIES = 50
+"""Bodies of a batch, common to several tests, which therefore share programs."""
+
+
+@jax.jit
+def compensated_motion(moments, wxyz, omega, t):
+    return free_motion(moments, wxyz, omega, t, compensated=True)
 
 
 def _fits_single(case: dict) -> bool:
@@ -172,11 +179,12 @@ def test_long_batches_are_cut_without_a_trace():
 def test_a_sphere_has_no_axis_that_the_momentum_may_not_be_across():
     """Any direction of the rates, along and across every axis, is a permanent rotation."""
     rates = np.array(np.meshgrid(*[(-1.0, 0.0, 0.5)] * 3)).reshape(3, -1).T
+    rates = np.resize(rates, (BODIES, 3))
     for dtype in (np.float64, np.float32):
-        omega, t = jnp.asarray(rates, dtype), jnp.full(len(rates), 1.5, dtype)
+        omega, t = jnp.asarray(rates, dtype), jnp.full(BODIES, 1.5, dtype)
         moments, wxyz = (
             jnp.full(omega.shape, 2, dtype),
-            jnp.tile(jnp.eye(4, dtype=dtype)[0], (27, 1)),
+            jnp.tile(jnp.eye(4, dtype=dtype)[0], (BODIES, 1)),
         )
         found, turned = MOTION(moments, wxyz, omega, t)
         np.testing.assert_array_equal(np.stack(found, -1), omega)
@@ -202,18 +210,16 @@ def test_single_precision_keeps_its_digits_over_long_times(x64, over_bodies):
     transformations drop double precision.
     """
     rng = np.random.default_rng(7)
-    moments, omega, wxyz = (rng.normal(size=(50, n)).astype(np.float32) for n in (3, 3, 4))
+    moments, omega, wxyz = (rng.normal(size=(BODIES, n)).astype(np.float32) for n in (3, 3, 4))
     moments = 1 + np.abs(moments)
     t = (1e4 / np.linalg.norm(omega, axis=1)).astype(np.float32)
-
-    def motion(moments, wxyz, omega, t):
-        return free_motion(moments, wxyz, omega, t, compensated=True)
-
     given = moments, wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True), omega, t
-    exact = jax.jit(motion)(*(jnp.asarray(x, jnp.float64) for x in given))
+    exact = compensated_motion(*(jnp.asarray(x, jnp.float64) for x in given))
     with jax.enable_x64(x64):
         given = [jnp.asarray(x, jnp.float32) for x in given]
-        found = jax.jit(jax.vmap(motion) if over_bodies else motion)(*given)
+        found = (jax.jit(jax.vmap(compensated_motion)) if over_bodies else compensated_motion)(
+            *given
+        )
     (rates, attitude), (exact_rates, exact_attitude) = (
         (np.stack(x, -1) for x in pair) for pair in (found, exact)
     )
@@ -241,9 +247,9 @@ def test_compensated_phases_next_to_the_separatrix():
 
 def test_conserved_over_long_times():
     rng = np.random.default_rng(6)
-    moments = jnp.asarray(rng.uniform(0.5, 1.0, (200, 3)))
-    wxyz, omega = jnp.asarray(rng.normal(size=(200, 4))), jnp.asarray(rng.normal(size=(200, 3)))
-    rates, attitude = MOTION(moments, wxyz, omega, jnp.full(200, 1e7))
+    moments = jnp.asarray(rng.uniform(0.5, 1.0, (BODIES, 3)))
+    wxyz, omega = (jnp.asarray(rng.normal(size=(BODIES, n))) for n in (4, 3))
+    rates, attitude = MOTION(moments, wxyz, omega, jnp.full(BODIES, 1e7))
     now, before = np.stack(rates, -1) * moments, np.asarray(omega * moments)
     np.testing.assert_allclose((now**2).sum(-1), (before**2).sum(-1), rtol=1e-14)
     energy = (now**2 / moments).sum(-1)

@@ -39,7 +39,7 @@ def conjugate(q) -> list:
     return [q[0], -q[1], -q[2], -q[3]]
 
 
-def _about(axis: int, angle) -> list:
+def about(axis: int, angle) -> list:
     q = [mp.cos(angle / 2), mp.mpf(0), mp.mpf(0), mp.mpf(0)]
     q[1 + axis] = mp.sin(angle / 2)
     return q
@@ -148,7 +148,7 @@ class Motion(NamedTuple):
         psi = psi + 2 * mp.pi * mp.nint((mp.pi - direction * whole - psi) / (2 * mp.pi))
         theta = mp.atan2(mp.hypot(L1, L2), L3)
         triad = quaternion_product(
-            _about(2, phi), quaternion_product(_about(1, theta), _about(2, psi))
+            about(2, phi), quaternion_product(about(1, theta), about(2, psi))
         )
         e = [[mp.mpf(0)] * 3 for _ in range(3)]  # rows: triad axes in body axes
         e[0][one], e[1][two], e[2][three] = mp.mpf(1), mp.mpf(1 if even else -1), mp.mpf(1)

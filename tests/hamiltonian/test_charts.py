@@ -34,7 +34,8 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", ["weight", pytest.param("general_tensor", marks=pytest.mark.slow)])
+@pytest.mark.slow  # faster: a heavy top in both, test_one_hamiltonian
+@pytest.mark.parametrize("name", ["weight", "general_tensor"])
 def test_both_charts_give_the_same_motion(name):
     """All other torques: tests/torques/test_every_torque.py."""
     scene = SCENES[name]

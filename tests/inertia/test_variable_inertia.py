@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 import polhode as ph
 
@@ -30,14 +31,7 @@ def tensor(t, a, xp):
 
 
 def matrix(q):
-    a, b, c, d = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
-            [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
-            [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
-        ]
-    )
+    return Rotation.from_quat(np.roll(q, -1)).as_matrix()
 
 
 def by_hand(inertia_of, a, forced):

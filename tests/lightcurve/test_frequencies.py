@@ -101,7 +101,7 @@ def test_meaning_names_mode_and_sums():
 def test_lattices_find_the_sums_of_a_long_curve():
     """The pair of the body is the first, with the variance of a least-squares fit."""
     t, value = _long(MIXED)
-    found = lightcurve.fourier_lattices(t, value, max_frequency=5.0, keep=20)
+    found = lightcurve.fourier_lattices(t, value, max_frequency=7.0, keep=20)
     assert np.all(np.diff(found.explained) <= 0)
     assert found.explained[0] > 0.9
     sums = _frequencies.LINES @ [found.f_phi[0], found.f_psi[0]]

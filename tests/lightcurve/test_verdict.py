@@ -419,7 +419,7 @@ def test_fourteen_points_are_too_few():
 def test_the_rotating_ellipsoid_is_found_with_its_geometry():
     """Its brightness is not periodic, since the directions change; the ellipsoid explains this."""
     axes, period = np.array([1.0, 0.6, 0.45]), 0.3
-    blank = curve_of(flat, noise=0.0, days=40)
+    blank = curve_of(flat, noise=0.0, days=90, each=12)  # as many points as in the cases
     state = ph.State([0.8, 0.4, -0.3, 0.2], [0, 0, 2 * np.pi / period])
     inertia = ph.Inertia.from_moments(np.sum(axes**2) - axes**2)
     back = ph.rotation.conjugate(ph.simulate(ph.Scene(inertia), state, blank.t).wxyz)
@@ -449,7 +449,7 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
 
 def test_a_rotating_body_is_found_where_the_best_ellipsoid_has_another_period():
     """Its light curve has strong odd harmonics, which no ellipsoid has."""
-    period, blank = 0.42, curve_of(flat, noise=0.0)
+    period, blank = 0.42, curve_of(flat, noise=0.0, each=12)
     attitude = np.array([0.8, 0.4, -0.3, 0.2])
     state = ph.State(attitude / np.linalg.norm(attitude), [0, 0, 2 * np.pi / period])
     inertia = ph.Inertia.from_moments([0.6, 0.8, 1.0])

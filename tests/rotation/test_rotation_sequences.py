@@ -30,16 +30,24 @@ def test_there_are_twelve_orders_each_about_body_and_space_axes():
     assert sum(sequence.is_proper for sequence in SEQUENCES) == 12
 
 
-@pytest.mark.parametrize("sequence", SEQUENCES, ids=lambda sequence: sequence.name)
-def test_agreement_with_scipy_and_round_trip(sequence):
-    angles = _angles(sequence)
+@pytest.fixture(scope="module")
+def converted():
+    """Matrices of each sequence, and the angles back: one program, which takes less than half the
+    time of twenty-four.
+    """
 
     @jax.jit
-    def both(first, second, third):
-        wxyz = rotation.euler_to_wxyz(first, second, third, sequence)
-        return rotation.wxyz_to_matrix(wxyz), rotation.wxyz_to_euler(wxyz, sequence)
+    def run(angles):
+        wxyz = [rotation.euler_to_wxyz(*x, s) for x, s in zip(angles, SEQUENCES)]
+        back = [rotation.wxyz_to_euler(q, s) for q, s in zip(wxyz, SEQUENCES)]
+        return [rotation.wxyz_to_matrix(q) for q in wxyz], back
 
-    matrix, back = both(*jnp.asarray(angles))
+    return dict(zip(SEQUENCES, zip(*run([_angles(s) for s in SEQUENCES]))))
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES, ids=lambda sequence: sequence.name)
+def test_agreement_with_scipy_and_round_trip(converted, sequence):
+    angles, (matrix, back) = _angles(sequence), converted[sequence]
     theirs = Rotation.from_euler(_scipy_name(sequence), angles.T)
     np.testing.assert_allclose(matrix, theirs.as_matrix(), rtol=0, atol=2e-15)
     # near an end of the range the error of the outer angles is eps/sin
@@ -48,24 +56,22 @@ def test_agreement_with_scipy_and_round_trip(sequence):
 
 
 @pytest.mark.parametrize("sequence", [Sequence.ZYZ, Sequence.XYZ, Sequence.ZYX_SPACE])
-@pytest.mark.parametrize("at", ["low", "high"])
-def test_ends_of_the_range_keep_the_rotation(sequence, at):
-    ends = (0.0, np.pi) if sequence.is_proper else (-np.pi / 2, np.pi / 2)
-    second = ends[at == "high"]
+def test_ends_of_the_range_keep_the_rotation(sequence):
     grid = np.linspace(-np.pi, np.pi, 9)
     first, third = (jnp.asarray(part.ravel()) for part in np.meshgrid(grid, grid))
 
     @jax.jit
-    def run(first, third):
+    def run(first, second, third):
         wxyz = rotation.euler_to_wxyz(first, second, third, sequence)
         angles, pull = jax.vjp(lambda q: rotation.wxyz_to_euler(q, sequence), wxyz)
         return wxyz, angles, rotation.euler_to_wxyz(*angles, sequence), pull(angles)[0]
 
-    wxyz, angles, again, gradient = run(first, third)
-    assert rotation.angle_between(wxyz, again).max() < 2e-15
-    assert all(jnp.abs(outer).max() <= jnp.pi for outer in (angles[0], angles[2]))
-    np.testing.assert_allclose(angles[1], second, atol=3e-16)
-    assert jnp.isfinite(gradient).all()
+    for second in (0.0, np.pi) if sequence.is_proper else (-np.pi / 2, np.pi / 2):
+        wxyz, angles, again, gradient = run(first, second, third)
+        assert rotation.angle_between(wxyz, again).max() < 2e-15
+        assert all(jnp.abs(outer).max() <= jnp.pi for outer in (angles[0], angles[2]))
+        np.testing.assert_allclose(angles[1], second, atol=3e-16)
+        assert jnp.isfinite(gradient).all()
 
 
 def test_angles_may_be_plain_numbers_and_broadcast():

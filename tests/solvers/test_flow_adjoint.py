@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from solvers import make_integrators_truth as bodies
+from solvers.heavy_top import heavy_top
 
 import polhode as ph
-from benchmarks.integrators import heavy_top
 from polhode import Extrapolation, FlowAdjoint, rotation
 from polhode._hamiltonian import (
     Dynamics,

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from solvers import make_integrators_truth as bodies
+from solvers.heavy_top import heavy_top
 
-from benchmarks.integrators import heavy_top
 from polhode import Extrapolation
 from polhode._integrate import Accuracy
 from polhode._integrate._extrapolation import order_for

@@ -20,27 +20,13 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parents[1]), str(HERE.parent / "free")]
 
 from reference_free import _step, _tensor
+from tumbling import about, quaternion_product as multiply
 
 from benchmarks.stress_families import Body, bodies, nutation
 
 DIGITS = 50
 # Deviations grow by up to nine decades: the squared step is still below double precision.
 STEP = mp.mpf(10) ** -21
-
-
-def product(a, b):
-    return [
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ]
-
-
-def turn(axis: int, angle):
-    q = [mp.cos(angle / 2), mp.mpf(0), mp.mpf(0), mp.mpf(0)]
-    q[axis + 1] = mp.sin(angle / 2)
-    return q
 
 
 def start_of(kind: str, x):
@@ -58,7 +44,7 @@ def start_of(kind: str, x):
         return tensor, [c / size for c in q], omega
     phi, theta, psi = rest[:3]
     a, b, c = rest[3:]
-    q = product(product(turn(2, phi), turn(1, theta)), turn(2, psi))
+    q = multiply(multiply(about(2, phi), about(1, theta)), about(2, psi))
     s, k = mp.sin(psi), mp.cos(psi)
     omega = [
         s * b - mp.sin(theta) * k * a,
@@ -93,12 +79,12 @@ def final(kind: str, long: bool, x):
     off = mp.norm(mp.matrix(again) - mp.matrix(momentum)) / mp.norm(mp.matrix(momentum))
     if off > mp.mpf(10) ** (8 - DIGITS):
         raise ArithmeticError(f"after a period the momentum is off by {mp.nstr(off, 3)}")
-    about = product(after, [q[0], -q[1], -q[2], -q[3]])
-    size = mp.sqrt(mp.fdot(about[1:], about[1:]))
-    angle = mp.atan2(size, about[0]) * whole
-    power = [mp.cos(angle), *(mp.sin(angle) * c / size for c in about[1:])]
+    rotation = multiply(after, [q[0], -q[1], -q[2], -q[3]])
+    size = mp.sqrt(mp.fdot(rotation[1:], rotation[1:]))
+    angle = mp.atan2(size, rotation[0]) * whole
+    power = [mp.cos(angle), *(mp.sin(angle) * c / size for c in rotation[1:])]
     q, momentum, rest = carry(inverse, q, momentum, t - whole * period)
-    return product(power, q), list(inverse * mp.matrix(momentum)), whole * once + rest
+    return multiply(power, q), list(inverse * mp.matrix(momentum)), whole * once + rest
 
 
 def truth(body: Body) -> dict:

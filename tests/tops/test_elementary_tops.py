@@ -63,7 +63,10 @@ CASES = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=pytest.mark.slow) if x in ("wheel", "driven") else x for x in CASES],
+    [  # damping also in tests/systems
+        x if x in ("free_wheel", "one_axis") else pytest.param(x, marks=pytest.mark.slow)
+        for x in CASES
+    ],
 )
 def test_exact_against_integration(name):
     scene, state, record = CASES[name]

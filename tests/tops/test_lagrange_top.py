@@ -14,7 +14,7 @@ import top_cases
 
 import polhode as ph
 from polhode import LagrangeTop, Rotor, UniformGravity
-from polhode._closed_forms._lagrange_top import lagrange_motion
+from polhode._closed_forms._lagrange_top import Top, lagrange_motion
 
 NAMES = list(top_cases.CASES)
 NUMBERS = np.array(list(top_cases.CASES.values())).T  # (10, cases): cases are lanes
@@ -28,9 +28,8 @@ def moved(numbers, t):
     q = q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
     zero = jnp.zeros_like(pull)
     force = jnp.stack([zero, zero, -pull], axis=-1)
-    wxyz, rates = lagrange_motion(
-        a, force, jnp.ones_like(pull), q, omega, c * omega[:, 2], t[:, None]
-    )
+    top = Top(a, force, jnp.ones_like(pull), q, omega, c * omega[:, 2])
+    wxyz, rates = lagrange_motion(top, t[:, None])
     return jnp.concatenate([rates[:, 0], wxyz[:, 0]], axis=-1).T
 
 

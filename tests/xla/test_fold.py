@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solvers.heavy_top import heavy_top
 
 import polhode as ph
-from benchmarks.integrators import heavy_top
 from polhode._hamiltonian import Dynamics, lie_poisson_field
 from polhode._integrate._field import BoundTerm
 from polhode._kernels import specialise

@@ -26,7 +26,7 @@ where dtheta is a rotation vector in space axes. With n = w/|w| and x = |w| t bo
 powers of [n]x times functions of x.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -61,6 +61,23 @@ from polhode._kernels import (
     with_derivative_rule,
 )
 from polhode._scene import Scene, UniformGravity, Wheels
+
+
+class Top(NamedTuple):
+    """N symmetric bodies about a fixed point, with their initial states.
+
+    ``transverse`` (N,): moment about any axis through the point perpendicular to body z [kg m^2];
+    ``force`` (N, 3): weight [N], space axes, acting at ``distance`` (N,) [m] along body z; ``wxyz``
+    (N, 4), ``omega`` (N, 3) [rad/s]: initial state; ``axial`` (N,): momentum along body z
+    [kg m^2/s], including that of wheels on the axis.
+    """
+
+    transverse: Float[Array, " n"]
+    force: Float[Array, "n 3"]
+    distance: Float[Array, " n"]
+    wxyz: Float[Array, "n 4"]
+    omega: Float[Array, "n 3"]
+    axial: Float[Array, " n"]
 
 
 class LagrangeTop(AbstractChunkedForm):
@@ -111,9 +128,8 @@ class LagrangeTop(AbstractChunkedForm):
         gravity: Any = scene.potential
         centre = as_lanes(gravity.centre, n, 1)
         force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
-        wxyz, omega = lagrange_motion(
-            transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed
-        )
+        top = Top(transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial)
+        wxyz, omega = lagrange_motion(top, elapsed)
         is_valid = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
         return wxyz, omega, is_valid & wheels_have_constant_momentum(scene, n)
 
@@ -149,98 +165,74 @@ def _times_tilt(tilt: tuple[Array, Array, Array], q: tuple[Array, ...]) -> tuple
 
 
 def lagrange_motion(
-    transverse: Float[Array, " n"],
-    force_space: Float[Array, "n 3"],
-    distance: Float[Array, " n"],
-    wxyz: Float[Array, "n 4"],
-    omega: Float[Array, "n 3"],
-    axial_momentum: Float[Array, " n"],
-    elapsed: Float[Array, "n t"],
+    top: Top, elapsed: Float[Array, "n t"]
 ) -> tuple[Float[Array, "n t 4"], Float[Array, "n t 3"]]:
     """Attitude and body rates after ``elapsed`` [s] of a symmetric body about a fixed point.
 
-    ``transverse``: moment about any axis through the point perpendicular to body z [kg m^2];
-    ``force_space``: weight [N], space axes, acting at ``distance`` [m] along body z; ``wxyz``,
-    ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], including that of
-    wheels on the axis. Klein & Sommerfeld, Theorie des Kreisels, VI. The closed form is
-    ``_long_motion``; ``short_motion`` replaces it if the body hardly moves in that time, and
-    ``with_weight`` has the derivatives by a force that is zero.
+    Klein & Sommerfeld, Theorie des Kreisels, VI. The closed form is ``_long_motion``;
+    ``short_motion`` replaces it if the body hardly moves in that time, and ``with_weight`` has the
+    derivatives by a force that is zero.
     """
     # The closed form fails in two cases: for a body that hardly moves its constants are quotients
     # of rounding errors, and without weight its derivatives by the weight are 0/0. Both have plain
     # formulas, which are evaluated only if a body of the batch needs them.
-    arguments: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
-    constants = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
-    angle = momentum_frequency(*constants)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
+    frequency = momentum_frequency(jax.lax.stop_gradient(top._replace(wxyz=None)))
+    angle = frequency[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
     is_short = angle < short_angle(elapsed.dtype)
     # Derivatives of the closed form would be NaN for these bodies: it is evaluated for another
     # motion.
     at_rest = jnp.all(is_short, axis=-1)[:, None]
-    weightless = jnp.all(force_space == 0, axis=-1, keepdims=True)
-    force = jnp.where(at_rest | weightless, 0, force_space)
-    start = jnp.where(at_rest, 1, omega)
-    other = (
-        transverse,
-        force,
-        distance,
-        wxyz,
-        start,
-        axial_momentum,
-        jnp.where(is_short, 0, elapsed),
+    weightless = jnp.all(top.force == 0, axis=-1, keepdims=True)
+    other = top._replace(
+        force=jnp.where(at_rest | weightless, 0, top.force), omega=jnp.where(at_rest, 1, top.omega)
     )
     closed_form: Any = kernel(_long_motion, repeated=True)
-    motion = closed_form(*other)
+    motion = closed_form(other, jnp.where(is_short, 0, elapsed))
 
     # For one body at a time: for all at once, this rarely used branch would take a third of the
     # compilation of a gradient.
-    def with_corrections(motion, arguments, elapsed):
+    def with_corrections(motion, top, elapsed):
         corrected: Any = kernel(_corrected, repeated=True)
-        lanes = list(motion), arguments, elapsed, is_short, weightless, at_rest
+        lanes = list(motion), top, elapsed, is_short, weightless, at_rest
         return map_chunks(lambda lane: corrected(*lane), lanes, elapsed.shape[0], 1)
 
-    def unchanged(motion, arguments, elapsed):
+    def unchanged(motion, top, elapsed):
         return list(motion)
 
     branch = any_of(jnp.where(is_short | weightless, 1, 0))
-    wxyz, omega = jax.lax.cond(branch, with_corrections, unchanged, motion, arguments, elapsed)
+    wxyz, omega = jax.lax.cond(branch, with_corrections, unchanged, motion, top, elapsed)
     return wxyz, omega
 
 
-def _corrected(motion, arguments: Any, elapsed, is_short, weightless, at_rest) -> Any:
+def _corrected(motion, top: Top, elapsed, is_short, weightless, at_rest) -> Any:
     """The motion with the two cases that the closed form lacks: see ``lagrange_motion``."""
-    transverse, force, distance, wxyz, omega, axial = arguments
-    short_samples = short_motion(
-        transverse, force, distance, wxyz, omega, axial, jnp.where(is_short, elapsed, 0)
-    )
-    corrected_motion = with_weight(
-        transverse, force, distance, wxyz, omega, axial, elapsed, motion, weightless & ~at_rest
-    )
+    short_samples = short_motion(top, jnp.where(is_short, elapsed, 0))
+    corrected_motion = with_weight(top, elapsed, motion, weightless & ~at_rest)
     motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(corrected_motion, motion)]
     return [jnp.where(is_short[..., None], x, y) for x, y in zip(short_samples, motion)]
 
 
-def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum, elapsed):
+def _long_motion(top: Top, elapsed):
     """The closed form, arguments and results as of ``lagrange_motion``."""
     # XLA compiles a loop for every axis, even of length one, and vectorises the last axis only:
     # axes of length one are removed, and the longer axis is last.
     lanes, count = elapsed.shape
     times, axis = elapsed, -1
-    arguments = transverse, force_space, distance, wxyz, omega, axial_momentum
     if lanes == 1:
-        times, arguments = jax.tree.map(lambda x: x[0], (times, arguments))
+        times, top = jax.tree.map(lambda x: x[0], (times, top))
     elif count < lanes:
         times, axis = times.T, -2
     if count == 1:
         times = jnp.squeeze(times, axis)
-    transverse, force_space, distance, wxyz, omega, axial_momentum = arguments
+    transverse, force, distance, wxyz, omega, axial = top
     one = opaque_ones(transverse)
     wxyz, omega = staged((jnp.unstack(wxyz, axis=-1), components(omega)), one)
-    tilt, force_component = staged(upward(components(force_space)), one)
+    tilt, force_component = staged(upward(components(force)), one)
     inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
     # In axes along the force the motion is that of the textbook. Spinors (Cayley-Klein parameters)
     # have no pole where the body is upright, unlike Euler angles.
     q, spin = staged(_times_tilt(inverse_tilt, wxyz), one), omega[2]
-    momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
+    momentum = (transverse * omega[0], transverse * omega[1], axial)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
     motion = lagrange_constants(transverse, spin, -force_component * distance, spinor, momentum)
     if count > 1:
@@ -265,10 +257,9 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
     return to_samples(q), to_samples(rates)
 
 
-def momentum_frequency(
-    transverse: Array, force: Array, distance: Array, omega: Array, axial: Array
-):
+def momentum_frequency(top: Top) -> Array:
     """(L^2 + 2 A |M|)^(1/2) / A (N,) [rad/s]; 0 for a body that remains at rest."""
+    transverse, force, distance, _, omega, axial = top
     weight = jnp.sqrt(jnp.sum(force * force, axis=-1)) * jnp.abs(distance)
     across = jnp.sum(omega[:, :2] ** 2, axis=-1)
     return jnp.sqrt(across + (axial / transverse) ** 2 + 2 * weight / transverse)
@@ -281,16 +272,9 @@ def short_angle(dtype) -> float:
     return (100 * float(jnp.finfo(dtype).eps)) ** (1 / 5)
 
 
-def short_motion(
-    transverse: Array,
-    force: Array,
-    distance: Array,
-    wxyz: Array,
-    omega: Array,
-    axial: Array,
-    elapsed: Array,
-) -> tuple[Array, Array]:
+def short_motion(top: Top, elapsed: Array) -> tuple[Array, Array]:
     """Attitude (N, T, 4) and body rates (N, T, 3); arguments as for ``lagrange_motion``."""
+    transverse, force, distance, wxyz, omega, axial = top
     momentum = transverse[:, None] * omega[:, :2]
     momentum = jnp.concatenate([momentum, axial[:, None]], axis=-1)
     arm_force = (distance / transverse)[:, None, None] * force[:, None]
@@ -333,15 +317,7 @@ def short_motion(
 
 
 def with_weight(
-    transverse: Array,
-    force: Array,
-    distance: Array,
-    wxyz: Array,
-    omega: Array,
-    axial: Array,
-    elapsed: Array,
-    motion: tuple[Array, Array],
-    applies: Array,
+    top: Top, elapsed: Array, motion: tuple[Array, Array], applies: Array
 ) -> list[Array]:
     """The ``motion`` without weight, with the derivatives by ``force``, which is zero.
 
@@ -354,29 +330,24 @@ def with_weight(
     def rule(operands, tangents, values):
         if not is_nonzero_tangent(tangents[0]):
             return [jnp.zeros_like(x) for x in values]
-        along = jax.jvp(lambda f: _first_order(f, *operands[1:]), operands[:1], tangents[:1])
-        return along[1]
+        force, *others, elapsed, q, applies = operands
 
-    operands = [force, transverse, distance, wxyz, omega, axial, elapsed, *motion, applies]
+        def by_force(force):
+            return _first_order(Top(others[0], force, *others[1:]), elapsed, q, applies)
+
+        return jax.jvp(by_force, (force,), (tangents[0],))[1]
+
+    others = top._replace(force=None)
+    operands = [top.force, *jax.tree.leaves(others), elapsed, motion[0], applies]
     changes = with_derivative_rule(rule, operands, [jnp.zeros_like(x) for x in motion])
     return [x + change for x, change in zip(motion, changes)]
 
 
-def _first_order(
-    force: Array,
-    transverse: Array,
-    distance: Array,
-    wxyz: Array,
-    omega: Array,
-    axial: Array,
-    elapsed: Array,
-    q: Array,
-    rates: Array,
-    applies: Array,
-) -> list[Array]:
+def _first_order(top: Top, elapsed: Array, q: Array, applies: Array) -> list[Array]:
     """First-order changes of attitude (N, T, 4) and rates (N, T, 3) of a motion without weight by a
-    small weight. Arguments as for ``with_weight``.
+    small weight. ``q``: attitude of this motion; other arguments as for ``with_weight``.
     """
+    transverse, force, distance, wxyz, omega, axial = top
     moment = transverse[:, None]
     momentum = jnp.concatenate([moment * omega[:, :2], axial[:, None]], axis=-1)
     rate = jnp.where(applies, rotation.rotate(wxyz, momentum) / moment, 1)
