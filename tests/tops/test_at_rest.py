@@ -149,8 +149,8 @@ def test_the_first_order_in_the_weight_is_left_to_derivatives_by_the_force(monke
     one, turning = jnp.ones(1), jnp.array([[0.5, -0.3, 2.0]])
     motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
 
-    def corrected(force, transverse):
-        given = transverse, force, one, motion[0][0], turning, 2 * one, one[:, None]
+    def corrected(force, distance):
+        given = force, distance, motion[0][0], turning, 2 * one, one[:, None]
         return _lagrange_top.with_weight(*given, motion, jnp.ones((1, 1), bool))
 
     none = jnp.zeros((1, 3))
@@ -182,10 +182,10 @@ def test_a_weight_has_second_derivatives_beside_the_first_order_in_it():
     """Bodies with weight do not use the first-order term, which must not make their Hessian NaN."""
     one, turning = jnp.ones(1), jnp.array([[0.5, -0.3, 2.0]])
     motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
-    arguments = one, turning[:, 2], motion[0][0], turning, 2 * one, one[:, None]
+    arguments = turning[:, 2], motion[0][0], turning, 2 * one, one[:, None]
 
     def rate(force, applies):
-        _, rates = _lagrange_top.with_weight(one, force, *arguments[1:], motion, applies[None])
+        _, rates = _lagrange_top.with_weight(force, *arguments, motion, applies[None])
         return jnp.sum(jnp.where(applies, rates[0, 0, 0], force[0, 0] ** 2))
 
     second = jax.jacfwd(jax.jacrev(rate))

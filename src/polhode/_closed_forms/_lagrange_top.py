@@ -1,8 +1,9 @@
 """Lagrange's top as a closed form: the method, the frame of the vertical, and two limits.
 
-The closed form (``_lagrange_curve``) measures momenta in units of (L^2 + 2 A |M|)^(1/2), M the
-moment of the weight. If that unit or the direction of the weight does not exist, two other formulas
-are used:
+Momenta, forces and torques are divided by the transverse moment A throughout: cubes of numbers in
+SI units leave the range of single precision. The closed form (``_lagrange_curve``) then measures
+momenta in units of (L^2 + 2 |M|)^(1/2), M the moment of the weight. If that unit or the direction
+of the weight does not exist, two other formulas are used:
 
 ``short_motion``: for times so short that the error of one Runge-Kutta step is below rounding. At
 rest without weight there is no unit of momentum, and with little weight the derivatives by it are
@@ -10,17 +11,17 @@ differences of large numbers. The equations of motion are regular there: a body 
 rest. A step of fourth order has all terms of first and second derivatives by state and weight.
 Apart from a rotation about its own axis at omega_z - L_z/A, the body moves like a sphere of moment
 A. If q is the attitude of the sphere, e = R z the axis, and r e the point at which the weight F
-acts, in space axes,
+acts, in space axes, with L and F divided by A,
 
-    dL/dt = r e x F,    dq/dt = (0, L) q / (2 A).
+    dL/dt = r e x F,    dq/dt = (0, L) q / 2.
 
 ``with_weight``: derivatives of the motion without weight by the weight. The closed form needs the
 direction of the weight, although the motion is analytic in its three components. The sphere above
-rotates as R(t) = exp(t [w]x) R(0), at the constant rate w = L/A in space axes. A small weight F at
+rotates as R(t) = exp(t [w]x) R(0), at the constant rate w = L in space axes. A small weight F at
 r e changes its momentum and attitude by
 
     dL(t) = r I(t) x F,    I(t) = integral of e from 0 to t,
-    dtheta(t) = r / A  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
+    dtheta(t) = r  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
 
 where dtheta is a rotation vector in space axes. With n = w/|w| and x = |w| t both are sums of
 powers of [n]x times functions of x.
@@ -169,8 +170,9 @@ def lagrange_motion(
     # The closed form fails in two cases: for a body that hardly moves its constants are quotients
     # of rounding errors, and without weight its derivatives by the weight are 0/0. Both have plain
     # formulas, which are evaluated only if a body of the batch needs them.
-    arguments: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
-    constants = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
+    force_space, axial = force_space / transverse[:, None], axial_momentum / transverse
+    arguments: tuple[Any, ...] = force_space, distance, wxyz, omega, axial
+    constants = jax.lax.stop_gradient((force_space, distance, omega, axial))
     angle = momentum_frequency(*constants)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
     is_short = angle < short_angle(elapsed.dtype)
     # Derivatives of the closed form would be NaN for these bodies: it is evaluated for another
@@ -179,15 +181,7 @@ def lagrange_motion(
     weightless = jnp.all(force_space == 0, axis=-1, keepdims=True)
     force = jnp.where(at_rest | weightless, 0, force_space)
     start = jnp.where(at_rest, 1, omega)
-    other = (
-        transverse,
-        force,
-        distance,
-        wxyz,
-        start,
-        axial_momentum,
-        jnp.where(is_short, 0, elapsed),
-    )
+    other = force, distance, wxyz, start, axial, jnp.where(is_short, 0, elapsed)
     closed_form: Any = kernel(_long_motion, repeated=True)
     motion = closed_form(*other)
 
@@ -208,41 +202,36 @@ def lagrange_motion(
 
 def _corrected(motion, arguments: Any, elapsed, is_short, weightless, at_rest) -> Any:
     """The motion with the two cases that the closed form lacks: see ``lagrange_motion``."""
-    transverse, force, distance, wxyz, omega, axial = arguments
-    short_samples = short_motion(
-        transverse, force, distance, wxyz, omega, axial, jnp.where(is_short, elapsed, 0)
-    )
-    corrected_motion = with_weight(
-        transverse, force, distance, wxyz, omega, axial, elapsed, motion, weightless & ~at_rest
-    )
+    short_samples = short_motion(*arguments, jnp.where(is_short, elapsed, 0))
+    corrected_motion = with_weight(*arguments, elapsed, motion, weightless & ~at_rest)
     motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(corrected_motion, motion)]
     return [jnp.where(is_short[..., None], x, y) for x, y in zip(short_samples, motion)]
 
 
-def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum, elapsed):
-    """The closed form, arguments and results as of ``lagrange_motion``."""
+def _long_motion(force_space, distance, wxyz, omega, axial, elapsed):
+    """The closed form: arguments as of ``short_motion``, results as of ``lagrange_motion``."""
     # XLA compiles a loop for every axis, even of length one, and vectorises the last axis only:
     # axes of length one are removed, and the longer axis is last.
     lanes, count = elapsed.shape
     times, axis = elapsed, -1
-    arguments = transverse, force_space, distance, wxyz, omega, axial_momentum
+    arguments = force_space, distance, wxyz, omega, axial
     if lanes == 1:
         times, arguments = jax.tree.map(lambda x: x[0], (times, arguments))
     elif count < lanes:
         times, axis = times.T, -2
     if count == 1:
         times = jnp.squeeze(times, axis)
-    transverse, force_space, distance, wxyz, omega, axial_momentum = arguments
-    one = opaque_ones(transverse)
+    force_space, distance, wxyz, omega, axial = arguments
+    one = opaque_ones(axial)
     wxyz, omega = staged((jnp.unstack(wxyz, axis=-1), components(omega)), one)
     tilt, force_component = staged(upward(components(force_space)), one)
     inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
     # In axes along the force the motion is that of the textbook. Spinors (Cayley-Klein parameters)
     # have no pole where the body is upright, unlike Euler angles.
     q, spin = staged(_times_tilt(inverse_tilt, wxyz), one), omega[2]
-    momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
+    momentum = (omega[0], omega[1], axial)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
-    motion = lagrange_constants(transverse, spin, -force_component * distance, spinor, momentum)
+    motion = lagrange_constants(spin, -force_component * distance, spinor, momentum)
     if count > 1:
         series = motion.series
         motion, h, tilt, spin = spread(
@@ -265,13 +254,11 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
     return to_samples(q), to_samples(rates)
 
 
-def momentum_frequency(
-    transverse: Array, force: Array, distance: Array, omega: Array, axial: Array
-):
-    """(L^2 + 2 A |M|)^(1/2) / A (N,) [rad/s]; 0 for a body that remains at rest."""
+def momentum_frequency(force: Array, distance: Array, omega: Array, axial: Array):
+    """(L^2 + 2 |M|)^(1/2) (N,) [rad/s]; 0 for a body that remains at rest."""
     weight = jnp.sqrt(jnp.sum(force * force, axis=-1)) * jnp.abs(distance)
     across = jnp.sum(omega[:, :2] ** 2, axis=-1)
-    return jnp.sqrt(across + (axial / transverse) ** 2 + 2 * weight / transverse)
+    return jnp.sqrt(across + axial**2 + 2 * weight)
 
 
 def short_angle(dtype) -> float:
@@ -282,7 +269,6 @@ def short_angle(dtype) -> float:
 
 
 def short_motion(
-    transverse: Array,
     force: Array,
     distance: Array,
     wxyz: Array,
@@ -290,17 +276,15 @@ def short_motion(
     axial: Array,
     elapsed: Array,
 ) -> tuple[Array, Array]:
-    """Attitude (N, T, 4) and body rates (N, T, 3); arguments as for ``lagrange_motion``."""
-    momentum = transverse[:, None] * omega[:, :2]
-    momentum = jnp.concatenate([momentum, axial[:, None]], axis=-1)
-    arm_force = (distance / transverse)[:, None, None] * force[:, None]
+    """Attitude (N, T, 4) and body rates (N, T, 3); arguments as for ``lagrange_motion``, force and
+    axial momentum over the transverse moment."""
+    momentum = jnp.concatenate([omega[:, :2], axial[:, None]], axis=-1)
+    arm_force = distance[:, None, None] * force[:, None]
     zero, one = jnp.zeros_like(elapsed), jnp.ones_like(elapsed)
     step = elapsed[..., None]
     start = (
         jnp.broadcast_to(wxyz[:, None], (*elapsed.shape, 4)),
-        jnp.broadcast_to(
-            (rotation.rotate(wxyz, momentum) / transverse[:, None])[:, None], (*elapsed.shape, 3)
-        ),
+        jnp.broadcast_to(rotation.rotate(wxyz, momentum)[:, None], (*elapsed.shape, 3)),
     )
 
     # One Runge-Kutta step of order 4, in space axes. The rotation about the axis of symmetry is
@@ -323,9 +307,7 @@ def short_motion(
     none = tuple(map(jnp.zeros_like, start))
     (_, total), _ = jax.lax.scan(stage, (none, none), weights)
     q, rate = (x + step * k for x, k in zip(start, total))
-    own_rotation = rotation_about(
-        (zero, zero, one), (omega[:, 2] - axial / transverse)[:, None] * elapsed
-    )
+    own_rotation = rotation_about((zero, zero, one), (omega[:, 2] - axial)[:, None] * elapsed)
     q = rotation.normalise(rotation.multiply(q, own_rotation))
     rate = rotation.rotate(rotation.conjugate(q), rate)
     spin = jnp.broadcast_to(omega[:, None, 2:], (*elapsed.shape, 1))
@@ -333,7 +315,6 @@ def short_motion(
 
 
 def with_weight(
-    transverse: Array,
     force: Array,
     distance: Array,
     wxyz: Array,
@@ -347,7 +328,7 @@ def with_weight(
 
     Second derivatives by it are NaN. ``applies`` (N, 1): bodies that rotate and have no weight; for
     all others the result and its derivatives are finite and not used. Other arguments as for
-    ``lagrange_motion``.
+    ``short_motion``.
     """
 
     # The changes are zero, and computed only in programs that differentiate by the force.
@@ -357,14 +338,13 @@ def with_weight(
         along = jax.jvp(lambda f: _first_order(f, *operands[1:]), operands[:1], tangents[:1])
         return along[1]
 
-    operands = [force, transverse, distance, wxyz, omega, axial, elapsed, *motion, applies]
+    operands = [force, distance, wxyz, omega, axial, elapsed, *motion, applies]
     changes = with_derivative_rule(rule, operands, [jnp.zeros_like(x) for x in motion])
     return [x + change for x, change in zip(motion, changes)]
 
 
 def _first_order(
     force: Array,
-    transverse: Array,
     distance: Array,
     wxyz: Array,
     omega: Array,
@@ -377,9 +357,8 @@ def _first_order(
     """First-order changes of attitude (N, T, 4) and rates (N, T, 3) of a motion without weight by a
     small weight. Arguments as for ``with_weight``.
     """
-    moment = transverse[:, None]
-    momentum = jnp.concatenate([moment * omega[:, :2], axial[:, None]], axis=-1)
-    rate = jnp.where(applies, rotation.rotate(wxyz, momentum) / moment, 1)
+    momentum = jnp.concatenate([omega[:, :2], axial[:, None]], axis=-1)
+    rate = jnp.where(applies, rotation.rotate(wxyz, momentum), 1)
     size = jnp.sqrt(jnp.sum(rate * rate, axis=-1, keepdims=True))
     n = rate / size
     axis = rotation.rotate(wxyz, jnp.broadcast_to(jnp.array([0, 0, 1], n.dtype), n.shape))
@@ -410,13 +389,11 @@ def _first_order(
         + c * x2_less_cosine
         + jnp.cross(n, first_sum + second_sum)
     )
-    angle = angle / (size * size * moment)[:, None]
+    angle = angle / (size * size)[:, None]
     rate_change = (a * x + b * one_less_cosine + c * x_less_sine) / size[:, None]
 
     half_angle = jnp.concatenate([jnp.zeros_like(x), angle / 2], axis=-1)
-    rate_change = rate_change / moment[:, None] + jnp.cross(
-        jnp.broadcast_to(rate[:, None], n.shape), angle
-    )
+    rate_change = rate_change + jnp.cross(jnp.broadcast_to(rate[:, None], n.shape), angle)
     rate_change = rotation.rotate(rotation.conjugate(q), rate_change)
     rate_change = jnp.concatenate([rate_change[..., :2], jnp.zeros_like(x)], axis=-1)
     return [rotation.multiply(half_angle, q), rate_change]
