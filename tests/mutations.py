@@ -201,8 +201,8 @@ MUTANTS = (
     ),
     Mutant(
         TOP,
-        "angle = angle / (size * size * moment)[:, None]",
-        "angle = angle / (size * moment)[:, None]",
+        "angle = angle / (size * size)[:, None]",
+        "angle = angle / size[:, None]",
         "the derivative of Lagrange's top by a weight that is zero is wrong",
         ("tops/test_at_rest.py::test_bodies_at_rest_among_others",),
     ),

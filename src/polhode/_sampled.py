@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._checks import ArrayLike, is_concrete
+from polhode._checks import ArrayLike, is_concrete, require_digits
 from polhode._failed import sound_state, where_lost
 from polhode._kernels import is_differentiated
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
@@ -22,7 +22,10 @@ from polhode._trajectory._trajectory import AbstractPropagator
 
 _COINCIDENT = 1e-9
 """[periods] Distance below which a saved time and the start of a period are the same time; or eight
-units in the last place of the times, if these are larger, as in single precision."""
+units in the last place of the times, if these are larger, as in single precision, but at most
+``_FARTHEST``."""
+
+_FARTHEST = 0.1
 
 
 def is_sampled(scene: Scene) -> bool:
@@ -36,7 +39,7 @@ def sampled_method(
     """The method for a scene with a ``SampledTorque``; ``method``: that of each segment, or None.
 
     Raises ValueError for different periods, for ``Record(work=True)``, and for times that are not
-    one row of concrete numbers.
+    one row of concrete numbers or do not resolve the period.
     """
     sampled_torques = [term for term in summands(scene.torque) if isinstance(term, SampledTorque)]
     periods = {term.period for term in sampled_torques}
@@ -74,13 +77,17 @@ class HeldCommands(AbstractMethod):
     @classmethod
     def of(cls, method: AbstractMethod, ts: np.ndarray, period: float) -> "HeldCommands":
         """For saved times ``ts`` (T,), and an edge every ``period`` from the first of them on."""
-        rounding = 8 * float(np.finfo(ts.dtype).eps) * float(np.max(np.abs(ts)))
+        dtype = ts.dtype
+        rounding = 8 * float(np.finfo(dtype).eps) * float(np.max(np.abs(ts))) / period
         ts = ts.astype(float)
         sign, start = np.sign(ts[-1] - ts[0]), ts[0]
         phase = sign * (ts - start) / period
-        is_near_edge = np.abs(phase - np.round(phase)) < max(_COINCIDENT, rounding / period)
+        coincident = max(_COINCIDENT, min(rounding, _FARTHEST))
+        is_near_edge = np.abs(phase - np.round(phase)) < coincident
         phase = np.where(is_near_edge, np.round(phase), phase)
         edges = np.arange(np.ceil(phase[-1]))
+        edge_times = start + sign * period * edges
+        require_digits("times of periods", edge_times, edge_times.astype(dtype))
         all_phases = np.union1d(edges, phase)
         # saved times exactly as passed, edges between them
         times = start + sign * period * all_phases

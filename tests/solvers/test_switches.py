@@ -89,6 +89,43 @@ def test_every_switch_of_a_program_is_found(fn, count, jumps):
     assert np.abs(bends).max() < 0.5
 
 
+def test_differences_of_clipped_values_do_not_consist_of_rounding():
+    """Compilers may round only one of the products in u - clip(u), u = a b: its sign is noise."""
+
+    def excess(x):
+        return jnp.clip(x, -1.0, 1.0) - x * (1 + jnp.finfo(x.dtype).eps)
+
+    x = jnp.array([0.3, -0.7, 1.4])
+    found = program(excess, x)
+    (value, *_), *_ = found.frozen(found.levels(x), x)
+    np.testing.assert_allclose(value, [0, 0, -0.4], rtol=1e-14)
+    slope = jax.jacfwd(lambda x: found.frozen(found.levels(x), x)[0][0])(x)
+    np.testing.assert_allclose(slope, jax.jacfwd(excess)(x), rtol=0, atol=1e-15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_law_that_asks_whether_it_is_clipped_does_not_slide(dtype):
+    """Until it is, the difference is the rounding of a product, whose sign changes in each step."""
+
+    def law(lib, rates):
+        command = dtype(-1.03) * rates
+        limited = lib.clip(command, dtype(-0.2), dtype(0.2))
+        return lib.where(lib.isclose(command, limited), dtype(-0.05), dtype(0.1)) + limited
+
+    torque = ph.FeedbackTorque(lambda t, wxyz, omega: law(jnp, omega))
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS.astype(dtype)), torque=torque)
+    omega = np.array([[0.2, 0.5, -0.1], [-0.6, 0.3, 0.5], [0.05, -0.3, 0.9]], dtype)
+    traj = ph.simulate(scene, ph.State(WXYZ.astype(dtype), omega), np.array([0, 4], dtype))
+    for start, end in zip(omega.astype(float), traj.last.omega_body):
+
+        def field(t, rates):
+            return (law(np, rates) - np.cross(rates, MOMENTS * rates)) / MOMENTS
+
+        want = solve_ivp(field, (0, 4), start, max_step=2e-3).y[:, -1]
+        np.testing.assert_allclose(end, want, rtol=0, atol=3e-4)
+
+
 def test_samples_of_an_attitude_are_no_switches():
     """The pieces of the interpolant join with two continuous derivatives. The two switches are
     those of the sine of a small angle.

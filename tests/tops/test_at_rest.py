@@ -149,8 +149,8 @@ def test_the_first_order_in_the_weight_is_left_to_derivatives_by_the_force(monke
     one, turning = jnp.ones(1), jnp.array([[0.5, -0.3, 2.0]])
     motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
 
-    def corrected(force, transverse):
-        top = _lagrange_top.Top(transverse, force, one, motion[0][0], turning, 2 * one)
+    def corrected(force, distance):
+        top = _lagrange_top.Top(force, distance, motion[0][0], turning, 2 * one)
         return _lagrange_top.with_weight(top, one[:, None], motion, jnp.ones((1, 1), bool))
 
     none = jnp.zeros((1, 3))
@@ -184,7 +184,7 @@ def test_a_weight_has_second_derivatives_beside_the_first_order_in_it():
     motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
 
     def rate(force, applies):
-        top = _lagrange_top.Top(one, force, turning[:, 2], motion[0][0], turning, 2 * one)
+        top = _lagrange_top.Top(force, turning[:, 2], motion[0][0], turning, 2 * one)
         _, rates = _lagrange_top.with_weight(top, one[:, None], motion, applies[None])
         return jnp.sum(jnp.where(applies, rates[0, 0, 0], force[0, 0] ** 2))
 

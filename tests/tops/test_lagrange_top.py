@@ -64,15 +64,25 @@ def bound_of(name):
     return 1e-2 if name == "marginal_sleeping" else 1e-11
 
 
+@pytest.mark.parametrize("unit", [1e-160, 1e160])
+def test_the_motion_does_not_depend_on_the_unit_of_mass(unit):
+    """Squares of moments and torques in this unit are not numbers of the dtype."""
+    other = NUMBERS * np.where(np.arange(10) < 3, unit, 1)[:, None]
+    got, want = (VALUE(tuple(jnp.asarray(x)), TIMES) for x in (other, NUMBERS))
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-12)
+
+
 @pytest.mark.slow
-def test_every_gradient_is_exact(exact):
-    x = jnp.asarray(NUMBERS)
+@pytest.mark.parametrize("unit", [1.0, 1e-110, 1e110])  # of mass: 1e330 is not a number
+def test_every_gradient_is_exact(exact, unit):
+    units = np.where(np.arange(10) < 3, unit, 1)
+    x = jnp.asarray(NUMBERS * units[:, None])
     rows = np.stack(
         [SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), TIMES) for k in range(7)]
     )  # (7, 10, cases), in reverse mode
     for j, (name, entry) in enumerate(zip(NAMES, exact)):
         want = np.array(entry["gradient"])
-        error = np.abs(rows[:, :, j] - want).max() / np.abs(want).max()
+        error = np.abs(rows[:, :, j] * units - want).max() / np.abs(want).max()
         assert error < bound_of(name), (name, error)
 
 

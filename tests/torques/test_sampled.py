@@ -143,6 +143,11 @@ def test_samples_at_the_ends_of_periods_are_edges_in_single_precision():
     state = ph.State(jnp.asarray(WXYZ, jnp.float32), jnp.asarray(OMEGA, jnp.float32))
     plan = ph.explain(ph.Scene(body, torque=fn), state, [100.0, 100.1, 100.7, 101.0])
     assert "; 10 segments" in plan.reason
+    # at 1e5 s times are 0.008 s apart: a sample in the middle of a period is no edge
+    plan = ph.explain(ph.Scene(body, torque=fn), state, [1e5, 1e5 + 0.05, 1e5 + 1])
+    assert "; 11 segments" in plan.reason
+    with pytest.raises(ValueError, match=r"no digits for steps of 0\.1 s in float32"):
+        ph.simulate(ph.Scene(body, torque=fn), state, [1e7, 1e7 + 10])
 
 
 def test_a_body_that_fails_does_not_fail_the_others():

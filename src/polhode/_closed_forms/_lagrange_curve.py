@@ -2,9 +2,10 @@
 
 Let u be the vertical, g = u . e3, M the moment of the weight, N = 2 A M, and p and b the momenta
 about the vertical and the axis. Then (A dg/dt)^2 = f(g) = 2 A (E - M g)(1 - g^2) - (p - b g)^2, a
-cubic. On its elliptic curve the Cayley-Klein parameters alpha = w + iz and beta = y + ix (of the
-attitude relative to u) are an exponential times a quotient of theta functions (Klein & Sommerfeld,
-Theorie des Kreisels, VI.5). Here they are written as
+cubic. The arguments below are momenta and torques divided by A, as if A were 1. On its elliptic
+curve the Cayley-Klein parameters alpha = w + iz and beta = y + ix (of the attitude relative to u)
+are an exponential times a quotient of theta functions (Klein & Sommerfeld, Theorie des Kreisels,
+VI.5). Here they are written as
 
     alpha(t) = exp(i k t) (c - d F) (h F E/x) (x E'/F) / ((F E) (E'/F)),   F = exp(2 i nu t),
 
@@ -46,7 +47,7 @@ class Cubic(NamedTuple):
     """f as a polynomial in g minus its initial value, reversed if needed so that its third root is
     the isolated one.
 
-    - ``momentum_unit`` [kg m^2/s]: unit of all momenta below;
+    - ``momentum_unit`` [rad/s]: unit of all momenta below, which are divided by A;
     - ``nutating``: whether this unit and the frequency of the nutation differ from 0;
     - ``circular``: whether the motion is between the first two roots (the lower pair of f);
       otherwise it is between the third and the second (the upper pair is the close one);
@@ -146,8 +147,8 @@ def _isolated_root_rule(primals, tangents):
 def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...]) -> Cubic:
     """The cubic of a state.
 
-    ``weight`` N = 2 A M [(kg m^2/s)^2] of either sign; ``vertical``: body components of the
-    vertical u1, u2, then 1 + g and 1 - g; ``momentum``: body components [kg m^2/s].
+    ``weight`` 2 M/A [1/s^2] of either sign; ``vertical``: body components of the vertical u1, u2,
+    then 1 + g and 1 - g; ``momentum``: body components over A [rad/s].
     """
     square = momentum[0] ** 2 + momentum[1] ** 2 + momentum[2] ** 2 + jnp.abs(weight)
     is_nonzero = square > 0
@@ -352,7 +353,6 @@ _SMALL = 0.05
 
 
 def lagrange_constants(
-    transverse: Array,
     spin: Array,
     pull: Array,
     spinor: tuple[Complex, Complex],
@@ -360,24 +360,23 @@ def lagrange_constants(
 ) -> LagrangeConstants:
     """The motion through a state.
 
-    ``transverse``: moment A [kg m^2]; ``spin``: omega_z [rad/s]; ``pull``: M [N m] of either sign
-    in V = M u . e3; ``spinor``: alpha = w + iz and beta = y + ix of the attitude relative to u, of
-    unit length; ``momentum``: body components [kg m^2/s], including that of wheels on the axis. All
-    of one shape.
+    ``spin``: omega_z [rad/s]; ``pull``: M/A [1/s^2] of either sign in V = M u . e3; ``spinor``:
+    alpha = w + iz and beta = y + ix of the attitude relative to u, of unit length; ``momentum``:
+    body components over A [rad/s], including that of wheels on the axis. All of one shape.
     """
     alpha, beta = spinor
     product = alpha * beta
     vertical = (-2 * product.re, 2 * product.im, 2 * alpha.square, 2 * beta.square)
-    one = opaque_ones(transverse)
-    f = staged(cubic(2 * transverse * pull, vertical, momentum), one)
+    one = opaque_ones(spin)
+    f = staged(cubic(2 * pull, vertical, momentum), one)
     c = curve(staged(f.landen_squared, one), one)
-    places, partners = _places(f, c, transverse)
+    places, partners = _places(f, c, spin)
     start, partner = staged(_staged_start(c, places.at(0), partners.at(0)), one)
     nu = staged(jnp.sqrt(f.width) / (4 * c.stretch), one)
     origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series, one)
     base = staged((partner - start) * (twist / origin), one)
     x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
-    both_ones = rows_of_ones(2, transverse)
+    both_ones = rows_of_ones(2, spin)
     log_derivative = _log_derivative(x, mirror, c, both_ones)
     # alpha vanishes where g = -1, before the reversal
     upward = f.sign > 0
@@ -394,10 +393,8 @@ def lagrange_constants(
         ),
         one,
     )
-    constants = LagrangeConstants(
-        c.series, start, partner, f.circular, nu * f.momentum_unit / transverse, None
-    )
-    frequency = f.momentum_unit / transverse
+    constants = LagrangeConstants(c.series, start, partner, f.circular, nu * f.momentum_unit, None)
+    frequency = f.momentum_unit
 
     circular, nutating, axial, series, start, partner, origin, base, nu, frequency, spin = _row(
         (

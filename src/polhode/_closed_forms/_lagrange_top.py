@@ -1,8 +1,9 @@
 """Lagrange's top as a closed form: the method, the frame of the vertical, and two limits.
 
-The closed form (``_lagrange_curve``) measures momenta in units of (L^2 + 2 A |M|)^(1/2), M the
-moment of the weight. If that unit or the direction of the weight does not exist, two other formulas
-are used:
+Momenta, forces and torques are divided by the transverse moment A throughout: cubes of numbers in
+SI units leave the range of single precision. The closed form (``_lagrange_curve``) then measures
+momenta in units of (L^2 + 2 |M|)^(1/2), M the moment of the weight. If that unit or the direction
+of the weight does not exist, two other formulas are used:
 
 ``short_motion``: for times so short that the error of one Runge-Kutta step is below rounding. At
 rest without weight there is no unit of momentum, and with little weight the derivatives by it are
@@ -10,17 +11,17 @@ differences of large numbers. The equations of motion are regular there: a body 
 rest. A step of fourth order has all terms of first and second derivatives by state and weight.
 Apart from a rotation about its own axis at omega_z - L_z/A, the body moves like a sphere of moment
 A. If q is the attitude of the sphere, e = R z the axis, and r e the point at which the weight F
-acts, in space axes,
+acts, in space axes, with L and F divided by A,
 
-    dL/dt = r e x F,    dq/dt = (0, L) q / (2 A).
+    dL/dt = r e x F,    dq/dt = (0, L) q / 2.
 
 ``with_weight``: derivatives of the motion without weight by the weight. The closed form needs the
 direction of the weight, although the motion is analytic in its three components. The sphere above
-rotates as R(t) = exp(t [w]x) R(0), at the constant rate w = L/A in space axes. A small weight F at
+rotates as R(t) = exp(t [w]x) R(0), at the constant rate w = L in space axes. A small weight F at
 r e changes its momentum and attitude by
 
     dL(t) = r I(t) x F,    I(t) = integral of e from 0 to t,
-    dtheta(t) = r / A  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
+    dtheta(t) = r  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
 
 where dtheta is a rotation vector in space axes. With n = w/|w| and x = |w| t both are sums of
 powers of [n]x times functions of x.
@@ -66,13 +67,12 @@ from polhode._scene import Scene, UniformGravity, Wheels
 class Top(NamedTuple):
     """N symmetric bodies about a fixed point, with their initial states.
 
-    ``transverse`` (N,): moment about any axis through the point perpendicular to body z [kg m^2];
-    ``force`` (N, 3): weight [N], space axes, acting at ``distance`` (N,) [m] along body z; ``wxyz``
-    (N, 4), ``omega`` (N, 3) [rad/s]: initial state; ``axial`` (N,): momentum along body z
-    [kg m^2/s], including that of wheels on the axis.
+    In units of A, the moment about any axis through the point perpendicular to body z: ``force``
+    (N, 3): weight over A, space axes, acting at ``distance`` (N,) [m] along body z; ``wxyz``
+    (N, 4), ``omega`` (N, 3) [rad/s]: initial state; ``axial`` (N,): momentum along body z over A
+    [rad/s], including that of wheels on the axis.
     """
 
-    transverse: Float[Array, " n"]
     force: Float[Array, "n 3"]
     distance: Float[Array, " n"]
     wxyz: Float[Array, "n 4"]
@@ -128,7 +128,8 @@ class LagrangeTop(AbstractChunkedForm):
         gravity: Any = scene.potential
         centre = as_lanes(gravity.centre, n, 1)
         force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
-        top = Top(transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial)
+        force, axial = force / transverse[:, None], axial / transverse
+        top = Top(force, centre[:, 2], state.wxyz, state.omega_body, axial)
         wxyz, omega = lagrange_motion(top, elapsed)
         is_valid = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
         return wxyz, omega, is_valid & wheels_have_constant_momentum(scene, n)
@@ -224,17 +225,17 @@ def _long_motion(top: Top, elapsed):
         times, axis = times.T, -2
     if count == 1:
         times = jnp.squeeze(times, axis)
-    transverse, force, distance, wxyz, omega, axial = top
-    one = opaque_ones(transverse)
+    force, distance, wxyz, omega, axial = top
+    one = opaque_ones(axial)
     wxyz, omega = staged((jnp.unstack(wxyz, axis=-1), components(omega)), one)
     tilt, force_component = staged(upward(components(force)), one)
     inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
     # In axes along the force the motion is that of the textbook. Spinors (Cayley-Klein parameters)
     # have no pole where the body is upright, unlike Euler angles.
     q, spin = staged(_times_tilt(inverse_tilt, wxyz), one), omega[2]
-    momentum = (transverse * omega[0], transverse * omega[1], axial)
+    momentum = (omega[0], omega[1], axial)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
-    motion = lagrange_constants(transverse, spin, -force_component * distance, spinor, momentum)
+    motion = lagrange_constants(spin, -force_component * distance, spinor, momentum)
     if count > 1:
         series = motion.series
         motion, h, tilt, spin = spread(
@@ -258,11 +259,11 @@ def _long_motion(top: Top, elapsed):
 
 
 def momentum_frequency(top: Top) -> Array:
-    """(L^2 + 2 A |M|)^(1/2) / A (N,) [rad/s]; 0 for a body that remains at rest."""
-    transverse, force, distance, _, omega, axial = top
+    """(L^2 + 2 |M|)^(1/2) (N,) [rad/s]; 0 for a body that remains at rest."""
+    force, distance, _, omega, axial = top
     weight = jnp.sqrt(jnp.sum(force * force, axis=-1)) * jnp.abs(distance)
     across = jnp.sum(omega[:, :2] ** 2, axis=-1)
-    return jnp.sqrt(across + (axial / transverse) ** 2 + 2 * weight / transverse)
+    return jnp.sqrt(across + axial**2 + 2 * weight)
 
 
 def short_angle(dtype) -> float:
@@ -274,17 +275,14 @@ def short_angle(dtype) -> float:
 
 def short_motion(top: Top, elapsed: Array) -> tuple[Array, Array]:
     """Attitude (N, T, 4) and body rates (N, T, 3); arguments as for ``lagrange_motion``."""
-    transverse, force, distance, wxyz, omega, axial = top
-    momentum = transverse[:, None] * omega[:, :2]
-    momentum = jnp.concatenate([momentum, axial[:, None]], axis=-1)
-    arm_force = (distance / transverse)[:, None, None] * force[:, None]
+    force, distance, wxyz, omega, axial = top
+    momentum = jnp.concatenate([omega[:, :2], axial[:, None]], axis=-1)
+    arm_force = distance[:, None, None] * force[:, None]
     zero, one = jnp.zeros_like(elapsed), jnp.ones_like(elapsed)
     step = elapsed[..., None]
     start = (
         jnp.broadcast_to(wxyz[:, None], (*elapsed.shape, 4)),
-        jnp.broadcast_to(
-            (rotation.rotate(wxyz, momentum) / transverse[:, None])[:, None], (*elapsed.shape, 3)
-        ),
+        jnp.broadcast_to(rotation.rotate(wxyz, momentum)[:, None], (*elapsed.shape, 3)),
     )
 
     # One Runge-Kutta step of order 4, in space axes. The rotation about the axis of symmetry is
@@ -307,9 +305,7 @@ def short_motion(top: Top, elapsed: Array) -> tuple[Array, Array]:
     none = tuple(map(jnp.zeros_like, start))
     (_, total), _ = jax.lax.scan(stage, (none, none), weights)
     q, rate = (x + step * k for x, k in zip(start, total))
-    own_rotation = rotation_about(
-        (zero, zero, one), (omega[:, 2] - axial / transverse)[:, None] * elapsed
-    )
+    own_rotation = rotation_about((zero, zero, one), (omega[:, 2] - axial)[:, None] * elapsed)
     q = rotation.normalise(rotation.multiply(q, own_rotation))
     rate = rotation.rotate(rotation.conjugate(q), rate)
     spin = jnp.broadcast_to(omega[:, None, 2:], (*elapsed.shape, 1))
@@ -323,7 +319,7 @@ def with_weight(
 
     Second derivatives by it are NaN. ``applies`` (N, 1): bodies that rotate and have no weight; for
     all others the result and its derivatives are finite and not used. Other arguments as for
-    ``lagrange_motion``.
+    ``short_motion``.
     """
 
     # The changes are zero, and computed only in programs that differentiate by the force.
@@ -333,12 +329,11 @@ def with_weight(
         force, *others, elapsed, q, applies = operands
 
         def by_force(force):
-            return _first_order(Top(others[0], force, *others[1:]), elapsed, q, applies)
+            return _first_order(Top(force, *others), elapsed, q, applies)
 
         return jax.jvp(by_force, (force,), (tangents[0],))[1]
 
-    others = top._replace(force=None)
-    operands = [top.force, *jax.tree.leaves(others), elapsed, motion[0], applies]
+    operands = [*top, elapsed, motion[0], applies]
     changes = with_derivative_rule(rule, operands, [jnp.zeros_like(x) for x in motion])
     return [x + change for x, change in zip(motion, changes)]
 
@@ -347,10 +342,9 @@ def _first_order(top: Top, elapsed: Array, q: Array, applies: Array) -> list[Arr
     """First-order changes of attitude (N, T, 4) and rates (N, T, 3) of a motion without weight by a
     small weight. ``q``: attitude of this motion; other arguments as for ``with_weight``.
     """
-    transverse, force, distance, wxyz, omega, axial = top
-    moment = transverse[:, None]
-    momentum = jnp.concatenate([moment * omega[:, :2], axial[:, None]], axis=-1)
-    rate = jnp.where(applies, rotation.rotate(wxyz, momentum) / moment, 1)
+    force, distance, wxyz, omega, axial = top
+    momentum = jnp.concatenate([omega[:, :2], axial[:, None]], axis=-1)
+    rate = jnp.where(applies, rotation.rotate(wxyz, momentum), 1)
     size = jnp.sqrt(jnp.sum(rate * rate, axis=-1, keepdims=True))
     n = rate / size
     axis = rotation.rotate(wxyz, jnp.broadcast_to(jnp.array([0, 0, 1], n.dtype), n.shape))
@@ -381,13 +375,11 @@ def _first_order(top: Top, elapsed: Array, q: Array, applies: Array) -> list[Arr
         + c * x2_less_cosine
         + jnp.cross(n, first_sum + second_sum)
     )
-    angle = angle / (size * size * moment)[:, None]
+    angle = angle / (size * size)[:, None]
     rate_change = (a * x + b * one_less_cosine + c * x_less_sine) / size[:, None]
 
     half_angle = jnp.concatenate([jnp.zeros_like(x), angle / 2], axis=-1)
-    rate_change = rate_change / moment[:, None] + jnp.cross(
-        jnp.broadcast_to(rate[:, None], n.shape), angle
-    )
+    rate_change = rate_change + jnp.cross(jnp.broadcast_to(rate[:, None], n.shape), angle)
     rate_change = rotation.rotate(rotation.conjugate(q), rate_change)
     rate_change = jnp.concatenate([rate_change[..., :2], jnp.zeros_like(x)], axis=-1)
     return [rotation.multiply(half_angle, q), rate_change]
