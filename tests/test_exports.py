@@ -32,6 +32,13 @@ def test_bodies_have_labels(traj):
         traj[0].to_xarray(["one"])
 
 
+def test_a_dataset_has_the_times_of_every_body(traj):
+    pytest.importorskip("xarray")
+    shared = eqx.tree_at(lambda t: t.ts, traj, traj.ts[None])  # one row of times for all bodies
+    data = shared.to_xarray()
+    np.testing.assert_array_equal(data.ts.sel(body=1), traj.ts)
+
+
 def test_scipy_there_and_back(traj):
     turned = traj[1].to_scipy()
     pointing = ph.rotation.rotate(traj.wxyz[1], jnp.array([[0.0, 0, 1]]))

@@ -106,7 +106,12 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
                 f" {trajectory.batch_shape}."
             )
         coords["body"] = ("body", names, {"long_name": "body"})
-    times = (time, np.asarray(trajectory.ts), {"units": "s", "long_name": "time"})
+    # times of each body may lack batch axes of the other arrays, or have a length of 1 there
+    sample_times = np.broadcast_to(
+        np.asarray(trajectory.ts),
+        (*(() if shared else trajectory.batch_shape), trajectory.ts.shape[-1]),
+    )
+    times = (time, sample_times, {"units": "s", "long_name": "time"})
     (coords if shared else data)["time" if shared else "ts"] = times
     attributes = {
         "Conventions": "CF-1.11",
