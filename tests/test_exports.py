@@ -39,6 +39,21 @@ def test_a_dataset_has_the_times_of_every_body(traj):
     np.testing.assert_array_equal(data.ts.sel(body=1), traj.ts)
 
 
+def test_the_unit_of_the_error_is_that_of_attitudes_or_of_rates_alone(traj):
+    pytest.importorskip("xarray")
+    for wxyz, unit in ((traj.wxyz, "rad"), (None, "1")):
+        recorded = ph.Trajectory(
+            traj.ts,
+            wxyz,
+            traj.omega_body,
+            traj.status,
+            traj.steps,
+            traj.scene,
+            error=jnp.zeros(2),
+        )
+        assert recorded.to_xarray().error.attrs["units"] == unit
+
+
 def test_scipy_there_and_back(traj):
     turned = traj[1].to_scipy()
     pointing = ph.rotation.rotate(traj.wxyz[1], jnp.array([[0.0, 0, 1]]))

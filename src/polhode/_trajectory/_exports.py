@@ -67,7 +67,12 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
             put("wheel_speed", trajectory.wheel_speed, wheels, "rad s-1", speed)
         done = "part of the work done by motor and friction of each wheel"
         put("motor_work", trajectory._motor_work, wheels, "J", done)
-    put("error", trajectory._error, batch, "rad", "estimated error at the last time")
+    unit, error = "rad", "estimated error of the attitude at the last time"
+    # with ``Record(save=)`` only the last attitude tells whether attitudes were computed
+    last = (wxyz,) if trajectory._saved is None else trajectory._final
+    if last is not None and last[0] is None:
+        unit, error = "1", "estimated relative error of the rates at the last time"
+    put("error", trajectory._error, batch, unit, error)
     put("event_time", trajectory._event_time, batch, "s", "time of the event that ended the motion")
     for path, values in jax.tree_util.tree_leaves_with_path(trajectory._saved):
         key = jax.tree_util.keystr(path, simple=True, separator="_")
