@@ -138,6 +138,12 @@ def test_variable_inertia():
     wrong = text.replace("[1, 1.25, 1.5]", "[1, 1.25, 2.5]")
     with pytest.raises(SceneFileError, match=r"\[inertia.table\].*\n?.*impossible moments"):
         build_scene(parse_scene(wrong), np.float64)
+    rows = "[[1, 0.1, 0, 0.1, 1.5, 0, 0, 0, 2], [1, 0.1, 0, {}, 1.5, 0, 0, 0, 2]]"
+    tensors = text.replace("[[1, 1.5, 2], [1, 1.25, 1.5]]", rows)
+    scene = build_scene(parse_scene(tensors.replace("{}", "0.1")), np.float64)
+    np.testing.assert_allclose(scene.inertia.at(1.0).full[0], [1e-7, 1e-8, 0])
+    with pytest.raises(SceneFileError, match=r"not symmetric\n.*row 2"):
+        build_scene(parse_scene(tensors.replace("{}", "0.2")), np.float64)
 
 
 CLUSTER = """

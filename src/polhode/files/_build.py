@@ -21,6 +21,7 @@ from polhode.files._read import SceneFileError, did_you_mean, possible_moments, 
 from polhode.files._tables import AnySolid, Attitudes
 from polhode.files._values import MOMENTS, Table, TimeTable
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
+from polhode.inertia._physical import is_symmetric
 
 if TYPE_CHECKING:
     import diffrax
@@ -83,7 +84,17 @@ def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
     """SceneFileError for an unphysical row of moments (n, 3) or tensors (n, 9)."""
     if rows.shape[-1] == 9:
         tensors = rows.reshape(-1, 3, 3)
-        rows = np.linalg.eigvalsh((tensors + np.swapaxes(tensors, 1, 2)) / 2)
+        is_skew = ~np.asarray(is_symmetric(jnp.asarray(tensors)))
+        if is_skew.any():
+            row = int(np.argmax(is_skew))
+            raise SceneFileError(
+                file.path,
+                "[inertia.table]",
+                "a tensor that is not symmetric",
+                f"row {row + 1}: {tensors[row].tolist()}",
+                "equal products of inertia above and below the diagonal",
+            )
+        rows = np.linalg.eigvalsh(tensors)
     impossible = ~possible_moments(rows)
     if impossible.any():
         row = int(np.argmax(impossible))
