@@ -196,6 +196,11 @@ def test_clusters_exert_the_torque_of_the_law():
         ('kind = "body"\nn = { values = [[0, 0, 1]] }', "times and values"),
         ('kind = "body"\nn = { file = "../n.csv" }', "leaves the folder"),
         (f'kind = "drag"\ndensity = -1\nvelocity = [1, 0, 0]{PLATES}', "[torque] density"),
+        (
+            f'kind = "drag"\ndensity = {{ times = [0, 1], values = [1, -999] }}\n'
+            f"velocity = [1, 0, 0]{PLATES}",
+            "must not be negative, got -999",
+        ),
         (f'kind = "drag"\ndensity = 1\nvelocity = "wind"{PLATES}', "[torque] velocity"),
         (f'kind = "drag"\ndensity = 1\nvelocity = "orbit"{PLATES}', "needs an [orbit]"),
         (

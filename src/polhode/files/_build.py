@@ -14,12 +14,13 @@ from jaxtyping import Array, DTypeLike, Float
 
 import polhode
 from polhode import rotation
+from polhode._checks import require_positive
 from polhode._hamiltonian import from_quaternion
 from polhode._scene import narrower
 from polhode.files._models import SceneFile
 from polhode.files._read import SceneFileError, did_you_mean, possible_moments, scene_errors
 from polhode.files._tables import AnySolid, Attitudes
-from polhode.files._values import MOMENTS, Table, TimeTable
+from polhode.files._values import MOMENTS, NumberTable, Table, TimeTable
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
 from polhode.inertia._physical import is_symmetric
 
@@ -55,9 +56,14 @@ def build_table(file: SceneFile, table: TimeTable, dtype: DTypeLike) -> "polhode
 
 
 def _over_time(file: SceneFile, value: Any, dtype: DTypeLike) -> Any:
-    """A constant as an array, or a ``Table`` over time."""
+    """A constant as an array, or a ``Table`` over time. Numbers (densities, visible parts of the
+    Sun) must not be negative, in a table either."""
     if isinstance(value, TimeTable):
-        return build_table(file, value, dtype)
+        table = build_table(file, value, dtype)
+        if isinstance(value, NumberTable):
+            hint = "remove rows without a value"
+            require_positive("the numbers of a table", table.values, zero=True, hint=hint)
+        return table
     return np.asarray(value, dtype)
 
 
