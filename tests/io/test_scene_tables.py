@@ -192,6 +192,10 @@ def test_clusters_exert_the_torque_of_the_law():
         ('kind = "body"\nn = [0, 1]', "[torque] n"),
         ('kind = "body"\nn = { times = [0, 1], values = [[0, 0, 1]] }', "2 times and 1 values"),
         ('kind = "body"\nn = { times = [1, 0], values = [[0, 0, 1], [0, 0, 1]] }', "ascend"),
+        (
+            'kind = "body"\nn = { times = [0, 0.5], values = [[0, 0, 1], [0, 0, 1]] }',
+            "[torque.n]: a table that does not cover the simulated times",
+        ),
         ('kind = "body"\nn = { times = [0, 1], values = [1, 2] }', "[torque.n] values"),
         ('kind = "body"\nn = { values = [[0, 0, 1]] }', "times and values"),
         ('kind = "body"\nn = { file = "../n.csv" }', "leaves the folder"),
