@@ -1,5 +1,6 @@
 """Tables over time, plates, gyroscopes, clusters and variable inertia of a scene file."""
 
+import os
 import re
 
 import jax
@@ -92,7 +93,7 @@ def test_the_velocity_of_drag_may_be_that_of_the_orbit():
     )
 
 
-def test_files_of_columns(tmp_path):
+def test_files_of_columns(tmp_path, monkeypatch):
     (tmp_path / "torque.csv").write_text(
         "t, x, y, z\n0, 0, 0, 1\n\n1, 0, 1, 0  # half\n3, 1, 0, 0\n"
     )
@@ -101,6 +102,15 @@ def test_files_of_columns(tmp_path):
     torque = build_scene(read_scene(tmp_path / "scene.toml"), np.float64).torque
     np.testing.assert_array_equal(torque.n.times, [0, 1, 3])
     np.testing.assert_array_equal(torque.n.values, [[0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    monkeypatch.chdir(tmp_path)  # where the files of a scene from standard input are
+    before = os.dup(0)
+    try:
+        with open("scene.toml") as file:
+            os.dup2(file.fileno(), 0)
+            assert read_scene("-").columns(read_scene("scene.toml").torque[0].n)[0] == [0, 1, 3]
+    finally:
+        os.dup2(before, 0)
+        os.close(before)
 
 
 @pytest.mark.parametrize(

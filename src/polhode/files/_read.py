@@ -103,14 +103,15 @@ MAX_KEY_PARTS = 200
 
 
 def read_scene(path: str | os.PathLike) -> "SceneFile":
-    """Read and check a scene file (TOML, docs/scene_files.md); "-" reads standard input.
+    """Read and check a scene file (TOML, docs/scene_files.md); "-" reads standard input, and the
+    files that the scene names from the current folder.
 
     Raises SceneFileError for a file that cannot be read, is larger than 16 MB, is not TOML, or
     breaks the schema: an unknown or missing key, a wrong type, shape or unit, a number that is not
     finite.
     """
     standard = os.fspath(path) == "-"
-    path = Path("/dev/stdin" if standard else path)
+    path = Path("stdin" if standard else path)
     try:
         with open(0 if standard else path, "rb", closefd=not standard) as file:
             data = file.read(MAX_BYTES + 1)
