@@ -497,11 +497,11 @@ def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: in
     for _ in range(_MAX_ROUNDS):
         draws = moments * (1 + noise(count))
         total += count
-        possible = possible_moments(draws)
-        redrawn += int((~possible).sum())
+        possible = np.flatnonzero(possible_moments(draws))[: count - len(accepted)]
         accepted = np.concatenate([accepted, draws[possible]])
-        if len(accepted) >= count:
-            return accepted[:count], redrawn
+        if len(accepted) == count:  # later draws of this round are not used, and not counted
+            return accepted, redrawn + int(possible[-1]) + 1 - len(possible)
+        redrawn += count - len(possible)
     raise SceneFileError(
         file.path,
         "[monte_carlo.moments] relative_sigma",
