@@ -165,6 +165,9 @@ def test_files(tmp_path):
     path.write_text(OBJ)
     body = MassProperties.from_mesh_file(path, density=2.0, unit=0.001)
     np.testing.assert_allclose(body.inertia.moments, [5.0, 10.0, 13.0], rtol=1e-12)
+    for unit, error in (("mm", TypeError), (-0.001, ValueError)):
+        with pytest.raises(error, match=r"^unit must be"):
+            MassProperties.from_mesh_file(path, density=2.0, unit=unit)
     with pytest.raises(FileNotFoundError):
         MassProperties.from_mesh_file(tmp_path / "none.obj", mass=1.0)
     broken = tmp_path / "broken.obj"

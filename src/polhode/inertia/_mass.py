@@ -14,6 +14,7 @@ from polhode._checks import (
     ArrayLike,
     as_float_array,
     as_floats,
+    as_positive,
     batch_of,
     is_concrete,
     require,
@@ -127,8 +128,10 @@ class MassProperties(AbstractShaped, Printable):
         """As ``from_mesh``, from a file (STL, OBJ, PLY, ...) read by trimesh.
 
         ``unit``: metres per unit of length of the file (0.001 for millimetres). Raises ImportError
-        without trimesh (extra ``mesh``), ValueError for an unreadable file or a bad mesh.
+        without trimesh (extra ``mesh``), ValueError for an unreadable file or a bad mesh,
+        TypeError or ValueError for a unit that is not a positive number.
         """
+        as_positive("unit", unit, hint="metres per unit of length of the file")
         vertices, faces = load_mesh(path)
         return cls.from_mesh(vertices * unit, faces, density=density, mass=mass)
 
