@@ -168,6 +168,9 @@ def test_messages_of_other_centuries(traj, tmp_path):
         ph.simulate(scene, slow, [0.0, 1e12]).to_aem(path, "2029-01-01T00:00:00", **fields)
     with pytest.raises(ValueError, match="object_name"):
         traj.to_aem(path, "2029-01-01T00:00:00", **FIELDS | {"object_name": 3})
+    for empty in (traj[:0], traj[..., 1:1]):
+        with pytest.raises(ValueError, match="one body and one sample or more"):
+            empty.to_aem(path, "2029-01-01T00:00:00", **FIELDS)
 
 
 def test_wheels_are_exported():

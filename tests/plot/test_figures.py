@@ -233,6 +233,9 @@ def test_missing_data_and_wrong_bodies_are_named(trajectory):
             plot.history(bare, body=body)
     with pytest.raises(TypeError, match=r"ph\.Trajectory"):
         plot.polhode(np.zeros((3, 3)))
+    for empty in (trajectory[:0], trajectory[..., 3:3]):
+        with pytest.raises(ValueError, match="one body and one sample or more"):
+            plot.overview(empty)
     with pytest.raises(ValueError, match="omega_body must have shape"):
         plot.samples([0.0, 1.0], [1.0, 2.0])
     with pytest.raises(ValueError, match="ts must have shape"):

@@ -169,6 +169,10 @@ def write_aem(
         raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
     wxyz = np.asarray(trajectory.wxyz, np.float64)
     count, samples = int(np.prod(wxyz.shape[:-2], dtype=int)), wxyz.shape[-2]
+    require(
+        count > 0 and samples > 0,
+        f"a message needs one body and one sample or more, got attitudes of shape {wxyz.shape}.",
+    )
     names = _one_per_body("object_name", object_name, count)
     identities = _one_per_body("object_id", object_id, count)
     text_fields = {"originator": originator, "frame": frame, "body_frame": body_frame}

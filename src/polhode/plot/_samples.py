@@ -153,6 +153,10 @@ def samples(
     omega = np.asarray(omega_body, np.float64)
     if omega.ndim < 2 or omega.shape[-1] != 3:
         raise ValueError(f"omega_body must have shape (..., T, 3), got {omega.shape}.")
+    if omega.size == 0:
+        raise ValueError(
+            f"a figure needs one body and one sample or more, got rates of shape {omega.shape}."
+        )
     lead, samples = omega.shape[:-2], omega.shape[-2]
 
     def flat(name, value, core):
