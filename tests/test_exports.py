@@ -1,6 +1,7 @@
 """Export of trajectories: labels in xarray, SciPy's rotations, CCSDS messages."""
 
 from datetime import datetime, timedelta
+from fractions import Fraction
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -164,6 +165,10 @@ def test_messages_of_other_centuries(traj, tmp_path):
         times = [x.split(" = ")[1] for x in path.read_text().splitlines() if "_TIME = " in x]
         expected = [datetime(2029, 1, 1) + timedelta(seconds=x) for x in ts.tolist()]
         assert [datetime.fromisoformat(x) for x in times] == expected
+    late = eqx.tree_at(lambda t: t.ts, traj, 1e10 + jnp.array([0.0, 0.999, 2.0]))
+    late.to_aem(path, "2029-01-01T00:00:00", **FIELDS)
+    exact = round(Fraction(float(late.ts[1]) - 1e10) * 10**9)  # [ns], of the double
+    assert f":40.{exact} " in path.read_text()
     with pytest.raises(ValueError, match="years 0 to 9999"):
         ph.simulate(scene, slow, [0.0, 1e12]).to_aem(path, "2029-01-01T00:00:00", **fields)
     with pytest.raises(ValueError, match="object_name"):

@@ -1,5 +1,6 @@
 """Export of trajectories: SciPy, xarray, and CCSDS attitude ephemeris messages."""
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -243,7 +244,9 @@ def _instant(name: str, value: Any) -> tuple[np.datetime64, int]:
 
 def _later(start: tuple[np.datetime64, int], seconds: float) -> str:
     """The calendar time ``seconds`` after ``start``."""
-    whole, rest = divmod(start[1] + round(float(seconds) * 1e9), 10**9)
+    fraction, integer = math.modf(seconds)  # exact, unlike the seconds times 1e9
+    nanoseconds = int(integer) * 10**9 + round(fraction * 1e9)
+    whole, rest = divmod(start[1] + nanoseconds, 10**9)
     years = abs(whole) / 31_556_952
     text = "" if years > 10_000 else str(start[0] + np.timedelta64(whole, "s"))
     if not re.match(r"\d{4}-", text):
