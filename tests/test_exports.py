@@ -1,6 +1,7 @@
 """Export of trajectories: labels in xarray, SciPy's rotations, CCSDS messages."""
 
 from datetime import datetime, timedelta
+from fractions import Fraction
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,6 +31,28 @@ def test_bodies_have_labels(traj):
             traj.to_xarray(labels)
     with pytest.raises(ValueError, match="labels name"):
         traj[0].to_xarray(["one"])
+
+
+def test_a_dataset_has_the_times_of_every_body(traj):
+    pytest.importorskip("xarray")
+    shared = eqx.tree_at(lambda t: t.ts, traj, traj.ts[None])  # one row of times for all bodies
+    data = shared.to_xarray()
+    np.testing.assert_array_equal(data.ts.sel(body=1), traj.ts)
+
+
+def test_the_unit_of_the_error_is_that_of_attitudes_or_of_rates_alone(traj):
+    pytest.importorskip("xarray")
+    for wxyz, unit in ((traj.wxyz, "rad"), (None, "1")):
+        recorded = ph.Trajectory(
+            traj.ts,
+            wxyz,
+            traj.omega_body,
+            traj.status,
+            traj.steps,
+            traj.scene,
+            error=jnp.zeros(2),
+        )
+        assert recorded.to_xarray().error.attrs["units"] == unit
 
 
 def test_scipy_there_and_back(traj):
@@ -142,10 +165,17 @@ def test_messages_of_other_centuries(traj, tmp_path):
         times = [x.split(" = ")[1] for x in path.read_text().splitlines() if "_TIME = " in x]
         expected = [datetime(2029, 1, 1) + timedelta(seconds=x) for x in ts.tolist()]
         assert [datetime.fromisoformat(x) for x in times] == expected
+    late = eqx.tree_at(lambda t: t.ts, traj, 1e10 + jnp.array([0.0, 0.999, 2.0]))
+    late.to_aem(path, "2029-01-01T00:00:00", **FIELDS)
+    exact = round(Fraction(float(late.ts[1]) - 1e10) * 10**9)  # [ns], of the double
+    assert f":40.{exact} " in path.read_text()
     with pytest.raises(ValueError, match="years 0 to 9999"):
         ph.simulate(scene, slow, [0.0, 1e12]).to_aem(path, "2029-01-01T00:00:00", **fields)
     with pytest.raises(ValueError, match="object_name"):
         traj.to_aem(path, "2029-01-01T00:00:00", **FIELDS | {"object_name": 3})
+    for empty in (traj[:0], traj[..., 1:1]):
+        with pytest.raises(ValueError, match="one body and one sample or more"):
+            empty.to_aem(path, "2029-01-01T00:00:00", **FIELDS)
 
 
 def test_wheels_are_exported():

@@ -203,6 +203,8 @@ def test_what_no_sample_has_is_refused(batch):
         batch.between(2.1, 2.2)
     with pytest.raises(ValueError, match=r"\(2, 3\)"):
         batch.at(jnp.zeros((3, 2, 1)))
+    with pytest.raises(ValueError, match="no samples"):
+        batch[..., 3:3].at(1.0)
     rates = ph.simulate(SCENES["free"], STATE, TS, record=ph.Record(attitude=False))
     with pytest.raises(ValueError, match="no wxyz"):
         rates.at(1.0)

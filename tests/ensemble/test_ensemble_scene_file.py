@@ -294,3 +294,14 @@ def test_the_method_is_that_of_the_bodies_drawn(tmp_path):
     ensemble = ens.Ensemble(scene, TURNING, 4, (spread,))
     ens.stream(ensemble, jnp.linspace(0, 5, 3), tmp_path / "s.zarr", name="tops")
     assert not ens.open_store(tmp_path / "s.zarr").status.values.any()
+
+
+@pytest.mark.slow
+def test_explain_names_the_method_of_a_block(tmp_path, capsys):
+    """Few bodies with a torque take other steps than many."""
+    (tmp_path / "s.toml").write_text(SCENE + '[[torque]]\nkind = "linear-damping"\nc = 0.1\n')
+    assert main(["explain", str(tmp_path / "s.toml")]) == 0
+    text = capsys.readouterr().out
+    assert "an ensemble of 9,000 bodies, seed 3, in blocks:" in text
+    assert "8,192 bodies x 3 samples" in text
+    assert "extrapolated midpoint rule" in text

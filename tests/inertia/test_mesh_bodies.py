@@ -106,9 +106,26 @@ def test_a_cavity_is_a_second_surface_facing_inwards():
     np.testing.assert_allclose(body.inertia.tensor, exact.tensor, atol=1e-15)
 
 
+def with_small_box(shift, inverted):
+    """The box, and one of half its size as a second shell."""
+    faces = FACES[:, ::-1] if inverted else FACES
+    return np.vstack([CORNERS, CORNERS / 2 + shift]), np.vstack([FACES, faces + 8])
+
+
+@pytest.mark.parametrize("shift", [[0.0, 0.25, 0.5], [0.25, 0.25, 0.25]])
+def test_shells_may_touch(shift):
+    hollow = MassProperties.from_mesh(*with_small_box(shift, True), density=1.0)
+    np.testing.assert_allclose(hollow.mass, 0.875)
+    beside = MassProperties.from_mesh(*with_small_box([1.0, *shift[1:]], False), density=1.0)
+    np.testing.assert_allclose(beside.mass, 1.125)
+
+
 @pytest.mark.parametrize(
     ("vertices", "faces", "error", "message"),
     [
+        (*with_small_box([1.0, 0.25, 0.25], True), ValueError, "1 of 2 separate shells"),
+        (*with_small_box([1.5, 0.25, 0.25], True), ValueError, "1 of 2 separate shells"),
+        (CORNERS, np.vstack([FACES, FACES]), ValueError, "12 faces more than once"),
         (CORNERS, FACES[:-1], ValueError, "3 of 18 edges with a hole"),
         (CORNERS, FACES[:, ::-1], ValueError, "all faces are inverted"),
         (CORNERS, np.vstack([FACES[:-1], FACES[-1:, ::-1]]), ValueError, "3 of 18 edges between"),
@@ -148,6 +165,9 @@ def test_files(tmp_path):
     path.write_text(OBJ)
     body = MassProperties.from_mesh_file(path, density=2.0, unit=0.001)
     np.testing.assert_allclose(body.inertia.moments, [5.0, 10.0, 13.0], rtol=1e-12)
+    for unit, error in (("mm", TypeError), (-0.001, ValueError)):
+        with pytest.raises(error, match=r"^unit must be"):
+            MassProperties.from_mesh_file(path, density=2.0, unit=unit)
     with pytest.raises(FileNotFoundError):
         MassProperties.from_mesh_file(tmp_path / "none.obj", mass=1.0)
     broken = tmp_path / "broken.obj"

@@ -51,10 +51,16 @@ def test_a_link_of_a_urdf_file(arm):
 
 def test_mujoco_reads_the_same_link(arm):
     """MuJoCo's own URDF reader is the independent reference."""
-    pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
-    ours, theirs = MassProperties.from_urdf(arm, "hand"), MassProperties.from_mjcf(arm, "hand")
-    np.testing.assert_allclose(ours.centre, theirs.centre, atol=1e-12)
-    np.testing.assert_allclose(ours.inertia.tensor, theirs.inertia.tensor, rtol=1e-8, atol=1e-12)
+    mujoco = pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
+    ours, theirs = MassProperties.from_urdf(arm, "hand"), mujoco.MjModel.from_xml_path(str(arm))
+    hand = theirs.body("hand")
+    turn = Rotation.from_quat(hand.iquat, scalar_first=True).as_matrix()
+    tensor = turn @ np.diag(hand.inertia) @ turn.T
+    np.testing.assert_allclose(ours.centre, hand.ipos, atol=1e-12)
+    np.testing.assert_allclose(ours.inertia.tensor, tensor, rtol=1e-8, atol=1e-12)
+    # it merges links with fixed joints, so that the mass of a link would be that of several
+    with pytest.raises(ValueError, match=r"arm\.urdf is a URDF file, which is read by from_urdf"):
+        MassProperties.from_mjcf(arm, "hand")
 
 
 def test_a_body_of_an_mjcf_file(tmp_path):

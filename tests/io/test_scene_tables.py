@@ -1,5 +1,6 @@
 """Tables over time, plates, gyroscopes, clusters and variable inertia of a scene file."""
 
+import os
 import re
 
 import jax
@@ -92,7 +93,7 @@ def test_the_velocity_of_drag_may_be_that_of_the_orbit():
     )
 
 
-def test_files_of_columns(tmp_path):
+def test_files_of_columns(tmp_path, monkeypatch):
     (tmp_path / "torque.csv").write_text(
         "t, x, y, z\n0, 0, 0, 1\n\n1, 0, 1, 0  # half\n3, 1, 0, 0\n"
     )
@@ -101,6 +102,15 @@ def test_files_of_columns(tmp_path):
     torque = build_scene(read_scene(tmp_path / "scene.toml"), np.float64).torque
     np.testing.assert_array_equal(torque.n.times, [0, 1, 3])
     np.testing.assert_array_equal(torque.n.values, [[0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    monkeypatch.chdir(tmp_path)  # where the files of a scene from standard input are
+    before = os.dup(0)
+    try:
+        with open("scene.toml") as file:
+            os.dup2(file.fileno(), 0)
+            assert read_scene("-").columns(read_scene("scene.toml").torque[0].n)[0] == [0, 1, 3]
+    finally:
+        os.dup2(before, 0)
+        os.close(before)
 
 
 @pytest.mark.parametrize(
@@ -138,6 +148,12 @@ def test_variable_inertia():
     wrong = text.replace("[1, 1.25, 1.5]", "[1, 1.25, 2.5]")
     with pytest.raises(SceneFileError, match=r"\[inertia.table\].*\n?.*impossible moments"):
         build_scene(parse_scene(wrong), np.float64)
+    rows = "[[1, 0.1, 0, 0.1, 1.5, 0, 0, 0, 2], [1, 0.1, 0, {}, 1.5, 0, 0, 0, 2]]"
+    tensors = text.replace("[[1, 1.5, 2], [1, 1.25, 1.5]]", rows)
+    scene = build_scene(parse_scene(tensors.replace("{}", "0.1")), np.float64)
+    np.testing.assert_allclose(scene.inertia.at(1.0).full[0], [1e-7, 1e-8, 0])
+    with pytest.raises(SceneFileError, match=r"not symmetric\n.*row 2"):
+        build_scene(parse_scene(tensors.replace("{}", "0.2")), np.float64)
 
 
 CLUSTER = """
@@ -186,10 +202,19 @@ def test_clusters_exert_the_torque_of_the_law():
         ('kind = "body"\nn = [0, 1]', "[torque] n"),
         ('kind = "body"\nn = { times = [0, 1], values = [[0, 0, 1]] }', "2 times and 1 values"),
         ('kind = "body"\nn = { times = [1, 0], values = [[0, 0, 1], [0, 0, 1]] }', "ascend"),
+        (
+            'kind = "body"\nn = { times = [0, 0.5], values = [[0, 0, 1], [0, 0, 1]] }',
+            "[torque.n]: a table that does not cover the simulated times",
+        ),
         ('kind = "body"\nn = { times = [0, 1], values = [1, 2] }', "[torque.n] values"),
         ('kind = "body"\nn = { values = [[0, 0, 1]] }', "times and values"),
         ('kind = "body"\nn = { file = "../n.csv" }', "leaves the folder"),
         (f'kind = "drag"\ndensity = -1\nvelocity = [1, 0, 0]{PLATES}', "[torque] density"),
+        (
+            f'kind = "drag"\ndensity = {{ times = [0, 1], values = [1, -999] }}\n'
+            f"velocity = [1, 0, 0]{PLATES}",
+            "must not be negative, got -999",
+        ),
         (f'kind = "drag"\ndensity = 1\nvelocity = "wind"{PLATES}', "[torque] velocity"),
         (f'kind = "drag"\ndensity = 1\nvelocity = "orbit"{PLATES}', "needs an [orbit]"),
         (

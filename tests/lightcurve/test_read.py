@@ -207,6 +207,8 @@ def test_fluxes_given_as_magnitudes_are_named():
     flux = 1 + 0.2 * np.sin(np.arange(20))
     with pytest.raises(ValueError, match=r"these are fluxes or counts"):
         lightcurve.LightCurve.of(t, 5000 * flux)
+    with pytest.raises(ValueError, match=r"placeholders such as 99\.99.*leave points"):
+        lightcurve.LightCurve.of(t, np.where(t > 10.1, 99.99, 15 + flux))
     named = lightcurve.LightCurve.of(t, flux / flux.mean())
     assert any("as a normalised flux" in note for note in named.notes)
     assert lightcurve.LightCurve.of(t, -2.5 * np.log10(flux)).notes == ()

@@ -155,7 +155,12 @@ def test_lambert_sphere_and_cube():
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     cube = lightcurve.Convex.from_mesh(corners, faces)
     # only the face x = 1 is both lit and seen
-    assert cube.brightness(sun, observer) == pytest.approx(np.cos(alpha) / (1 + np.cos(alpha)))
+    seen = np.cos(alpha) / (1 + np.cos(alpha))
+    assert cube.brightness(sun, observer) == pytest.approx(seen)
+    # an edge that is divided in one of its two faces, and the triangle without an area beside it
+    divided = [f for f in faces.tolist() if f != [0, 1, 3]] + [[0, 8, 3], [8, 1, 3], [0, 1, 8]]
+    split = lightcurve.Convex.from_mesh(np.vstack([corners, [[0, 0, 0.5]]]), np.array(divided))
+    assert split.brightness(sun, observer) == pytest.approx(seen)
 
 
 def test_harmonics_are_those_of_scipy():

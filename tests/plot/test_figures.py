@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 matplotlib.use("agg")
 from matplotlib import pyplot as plt
@@ -190,6 +191,26 @@ def test_animation_is_written_whole(trajectory, tmp_path, ending):
     plt.close(animation._fig)
 
 
+def test_panels_of_bodies_with_times_of_their_own_show_one_time(monkeypatch, tmp_path):
+    ts = np.stack([np.linspace(0, 10, 41), np.linspace(5, 20, 41)])
+    half = 0.1 * ts
+    wxyz = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
+    rates = np.broadcast_to([0.0, 0.0, 0.2], (2, 41, 3))
+    bodies = plot.samples(ts, rates, 3 * wxyz, ph.Inertia.from_moments(MOMENTS))
+    np.testing.assert_allclose(bodies.wxyz, wxyz, atol=1e-15)
+    shown, draw = [], Poly3DCollection.set_verts
+    monkeypatch.setattr(
+        Poly3DCollection,
+        "set_verts",
+        lambda self, verts, *rest: (shown.append(verts), draw(self, verts, *rest)),
+    )
+    animation = plot.animate(bodies, tmp_path / "two.gif", seconds=0.3, fps=10, dpi=20)
+    shown.clear()
+    *_, title = animation._func(1)
+    np.testing.assert_allclose(*shown, atol=1e-3)
+    assert title.get_text() == "t = 10.00 s"
+
+
 def test_animation_refuses_what_it_cannot_write(trajectory, tmp_path):
     with pytest.raises(ValueError, match=r"\.gif, \.mp4 or \.html"):
         plot.animate(trajectory, tmp_path / "a.avi")
@@ -212,6 +233,9 @@ def test_missing_data_and_wrong_bodies_are_named(trajectory):
             plot.history(bare, body=body)
     with pytest.raises(TypeError, match=r"ph\.Trajectory"):
         plot.polhode(np.zeros((3, 3)))
+    for empty in (trajectory[:0], trajectory[..., 3:3]):
+        with pytest.raises(ValueError, match="one body and one sample or more"):
+            plot.overview(empty)
     with pytest.raises(ValueError, match="omega_body must have shape"):
         plot.samples([0.0, 1.0], [1.0, 2.0])
     with pytest.raises(ValueError, match="ts must have shape"):

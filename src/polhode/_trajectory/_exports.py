@@ -1,5 +1,6 @@
 """Export of trajectories: SciPy, xarray, and CCSDS attitude ephemeris messages."""
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
@@ -67,7 +68,12 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
             put("wheel_speed", trajectory.wheel_speed, wheels, "rad s-1", speed)
         done = "part of the work done by motor and friction of each wheel"
         put("motor_work", trajectory._motor_work, wheels, "J", done)
-    put("error", trajectory._error, batch, "rad", "estimated error at the last time")
+    unit, error = "rad", "estimated error of the attitude at the last time"
+    # with ``Record(save=)`` only the last attitude tells whether attitudes were computed
+    last = (wxyz,) if trajectory._saved is None else trajectory._final
+    if last is not None and last[0] is None:
+        unit, error = "1", "estimated relative error of the rates at the last time"
+    put("error", trajectory._error, batch, unit, error)
     put("event_time", trajectory._event_time, batch, "s", "time of the event that ended the motion")
     for path, values in jax.tree_util.tree_leaves_with_path(trajectory._saved):
         key = jax.tree_util.keystr(path, simple=True, separator="_")
@@ -106,7 +112,12 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
                 f" {trajectory.batch_shape}."
             )
         coords["body"] = ("body", names, {"long_name": "body"})
-    times = (time, np.asarray(trajectory.ts), {"units": "s", "long_name": "time"})
+    # times of each body may lack batch axes of the other arrays, or have a length of 1 there
+    sample_times = np.broadcast_to(
+        np.asarray(trajectory.ts),
+        (*(() if shared else trajectory.batch_shape), trajectory.ts.shape[-1]),
+    )
+    times = (time, sample_times, {"units": "s", "long_name": "time"})
     (coords if shared else data)["time" if shared else "ts"] = times
     attributes = {
         "Conventions": "CF-1.11",
@@ -159,6 +170,10 @@ def write_aem(
         raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
     wxyz = np.asarray(trajectory.wxyz, np.float64)
     count, samples = int(np.prod(wxyz.shape[:-2], dtype=int)), wxyz.shape[-2]
+    require(
+        count > 0 and samples > 0,
+        f"a message needs one body and one sample or more, got attitudes of shape {wxyz.shape}.",
+    )
     names = _one_per_body("object_name", object_name, count)
     identities = _one_per_body("object_id", object_id, count)
     text_fields = {"originator": originator, "frame": frame, "body_frame": body_frame}
@@ -229,7 +244,9 @@ def _instant(name: str, value: Any) -> tuple[np.datetime64, int]:
 
 def _later(start: tuple[np.datetime64, int], seconds: float) -> str:
     """The calendar time ``seconds`` after ``start``."""
-    whole, rest = divmod(start[1] + round(float(seconds) * 1e9), 10**9)
+    fraction, integer = math.modf(seconds)  # exact, unlike the seconds times 1e9
+    nanoseconds = int(integer) * 10**9 + round(fraction * 1e9)
+    whole, rest = divmod(start[1] + nanoseconds, 10**9)
     years = abs(whole) / 31_556_952
     text = "" if years > 10_000 else str(start[0] + np.timedelta64(whole, "s"))
     if not re.match(r"\d{4}-", text):

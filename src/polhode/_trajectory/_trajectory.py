@@ -303,6 +303,8 @@ class Trajectory(eqx.Module):
             traj.at(jnp.linspace(0, 10, 501)).energy
         """
         _ = self.wxyz, self.omega_body  # both must have been recorded
+        if self.ts.shape[-1] == 0:
+            raise ValueError("this trajectory has no samples from which a motion can continue.")
         if self.propagator is None:
             raise ValueError(
                 "this trajectory was made by hand, without a method to move it by: use one that"

@@ -46,9 +46,19 @@ def explain(
     from polhode.cli._job import prepare
 
     job = prepare(file, precision)
+    times, monte_carlo, ensemble = file.times, file.monte_carlo, file.ensemble
+    parts, state = job.scene, job.state
+    if ensemble is not None:  # the method depends on the drawn bodies, and on their number
+        import numpy as np
+
+        from polhode.ensemble import build_ensemble
+        from polhode.ensemble._stream import block_size
+
+        block = block_size(len(job.ts))
+        indices = np.minimum(np.arange(block), ensemble.bodies - 1)
+        parts, state = build_ensemble(file, precision)[0].draw(indices)
     with scene_errors(file, ""):
-        plan = polhode.explain(job.scene, job.state, job.ts, job.method, rtol=job.rtol)
-    times, monte_carlo = file.times, file.monte_carlo
+        plan = polhode.explain(parts, state, job.ts, job.method, rtol=job.rtol)
     first, last = (times.seconds[k] / times.unit_seconds for k in (0, -1))
     print(f"{escape(file.title)}\n  source: {escape(file.source) or 'not stated'}")
     print(f"  {len(times.seconds)} samples from {first:g} to {last:g} {times.unit}, {precision}")
@@ -56,6 +66,8 @@ def explain(
         print(f"  {monte_carlo.clones} clones, seed {monte_carlo.seed}, drawn from the spread of:")
         for quantity, spread in monte_carlo.spreads.items():
             print(f"    {quantity}: {escape(spread.source)}")
+    if ensemble is not None:
+        print(f"  an ensemble of {ensemble.bodies:,} bodies, seed {ensemble.seed}, in blocks:")
     print(f"\n{plan}")
     return 0
 

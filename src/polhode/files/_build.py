@@ -14,13 +14,15 @@ from jaxtyping import Array, DTypeLike, Float
 
 import polhode
 from polhode import rotation
+from polhode._checks import require_positive
 from polhode._hamiltonian import from_quaternion
 from polhode._scene import narrower
 from polhode.files._models import SceneFile
 from polhode.files._read import SceneFileError, did_you_mean, possible_moments, scene_errors
 from polhode.files._tables import AnySolid, Attitudes
-from polhode.files._values import MOMENTS, Table, TimeTable
+from polhode.files._values import MOMENTS, NumberTable, Table, TimeTable
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
+from polhode.inertia._physical import is_symmetric
 
 if TYPE_CHECKING:
     import diffrax
@@ -54,9 +56,14 @@ def build_table(file: SceneFile, table: TimeTable, dtype: DTypeLike) -> "polhode
 
 
 def _over_time(file: SceneFile, value: Any, dtype: DTypeLike) -> Any:
-    """A constant as an array, or a ``Table`` over time."""
+    """A constant as an array, or a ``Table`` over time. Numbers (densities, visible parts of the
+    Sun) must not be negative, in a table either."""
     if isinstance(value, TimeTable):
-        return build_table(file, value, dtype)
+        table = build_table(file, value, dtype)
+        if isinstance(value, NumberTable):
+            hint = "remove rows without a value"
+            require_positive("the numbers of a table", table.values, zero=True, hint=hint)
+        return table
     return np.asarray(value, dtype)
 
 
@@ -83,7 +90,17 @@ def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
     """SceneFileError for an unphysical row of moments (n, 3) or tensors (n, 9)."""
     if rows.shape[-1] == 9:
         tensors = rows.reshape(-1, 3, 3)
-        rows = np.linalg.eigvalsh((tensors + np.swapaxes(tensors, 1, 2)) / 2)
+        is_skew = ~np.asarray(is_symmetric(jnp.asarray(tensors)))
+        if is_skew.any():
+            row = int(np.argmax(is_skew))
+            raise SceneFileError(
+                file.path,
+                "[inertia.table]",
+                "a tensor that is not symmetric",
+                f"row {row + 1}: {tensors[row].tolist()}",
+                "equal products of inertia above and below the diagonal",
+            )
+        rows = np.linalg.eigvalsh(tensors)
     impossible = ~possible_moments(rows)
     if impossible.any():
         row = int(np.argmax(impossible))
@@ -480,11 +497,11 @@ def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: in
     for _ in range(_MAX_ROUNDS):
         draws = moments * (1 + noise(count))
         total += count
-        possible = possible_moments(draws)
-        redrawn += int((~possible).sum())
+        possible = np.flatnonzero(possible_moments(draws))[: count - len(accepted)]
         accepted = np.concatenate([accepted, draws[possible]])
-        if len(accepted) >= count:
-            return accepted[:count], redrawn
+        if len(accepted) == count:  # later draws of this round are not used, and not counted
+            return accepted, redrawn + int(possible[-1]) + 1 - len(possible)
+        redrawn += count - len(possible)
     raise SceneFileError(
         file.path,
         "[monte_carlo.moments] relative_sigma",

@@ -86,7 +86,9 @@ class Times(Table):
 
     @property
     def first(self) -> float:
-        """`start`, or 0."""
+        """The first time, in the unit: `start`, or 0, or the first of `values`."""
+        if self.values is not None:
+            return self.values[0]
         return 0.0 if self.start is None else self.start
 
     @property
@@ -111,11 +113,17 @@ class Times(Table):
 
         if self.values is not None:
             return np.array(self.values) * self.unit_seconds
+        return np.linspace(self.first, self.last, self.samples) * self.unit_seconds
+
+    @property
+    def last(self) -> float:
+        """The last time, in the unit."""
+        if self.values is not None:
+            return self.values[-1]
         assert self.stop is not None  # the model requires it
-        last = self.stop
-        if self.step is not None:
-            last = self.first + math.copysign(self.step, last - self.first) * (self.samples - 1)
-        return np.linspace(self.first, last, self.samples) * self.unit_seconds
+        if self.step is None:
+            return self.stop
+        return self.first + math.copysign(self.step, self.stop - self.first) * (self.samples - 1)
 
 
 class Method(Table):

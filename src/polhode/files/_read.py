@@ -103,14 +103,15 @@ MAX_KEY_PARTS = 200
 
 
 def read_scene(path: str | os.PathLike) -> "SceneFile":
-    """Read and check a scene file (TOML, docs/scene_files.md); "-" reads standard input.
+    """Read and check a scene file (TOML, docs/scene_files.md); "-" reads standard input, and the
+    files that the scene names from the current folder.
 
     Raises SceneFileError for a file that cannot be read, is larger than 16 MB, is not TOML, or
     breaks the schema: an unknown or missing key, a wrong type, shape or unit, a number that is not
     finite.
     """
     standard = os.fspath(path) == "-"
-    path = Path("/dev/stdin" if standard else path)
+    path = Path("stdin" if standard else path)
     try:
         with open(0 if standard else path, "rb", closefd=not standard) as file:
             data = file.read(MAX_BYTES + 1)
@@ -149,6 +150,7 @@ def parse_scene(
     if plan is not None and plan.arrays is not None:
         file._rows = _read_arrays(dict(plan.arrays.entries()), plan.bodies, path)
     file._columns = _read_tables(file, path)
+    _check_spans(file, path)
     return file
 
 
@@ -340,6 +342,24 @@ def _read_tables(file: "SceneFile", scene: Path) -> dict[str, list[list[float]]]
         except ValueError as error:
             raise SceneFileError(scene, f"{place} file", str(error), table.file) from None
     return tables
+
+
+def _check_spans(file: "SceneFile", scene: Path) -> None:
+    """SceneFileError for a table over time that does not cover the simulated times."""
+    unit = file.times.unit_seconds
+    first, last = sorted((file.times.first * unit, file.times.last * unit))
+    rounding = 1e-9 * (last - first)
+    for place, table in file.tables:
+        times, _ = file.columns(table)
+        if not (times[0] <= first + rounding and last - rounding <= times[-1]):
+            raise SceneFileError(
+                scene,
+                place,
+                "a table that does not cover the simulated times",
+                f"{times[0]:.10g} to {times[-1]:.10g} s",
+                f"times from {first:.10g} to {last:.10g} s",
+                "add rows, because the last polynomial would be continued; check the unit",
+            )
 
 
 def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:

@@ -14,6 +14,7 @@ from polhode._checks import (
     ArrayLike,
     as_float_array,
     as_floats,
+    as_positive,
     batch_of,
     is_concrete,
     require,
@@ -86,8 +87,10 @@ class MassProperties(AbstractShaped, Printable):
 
         ``vertices`` (..., v, 3), m, differentiable; ``faces`` (f, 3) integers, counter-clockwise
         seen from outside, the same for a whole batch; either ``density``, kg/m^3, or ``mass``, kg.
-        Raises ValueError for holes, inverted faces, vertex numbers out of range, an enclosed
-        volume that is not positive, TypeError for faces that are not integers.
+        The wall of a cavity is a shell that faces inwards. Raises ValueError for holes, inverted
+        or repeated faces, an inverted shell that is not inside of another one, vertex numbers out
+        of range, an enclosed volume that is not positive, TypeError for faces that are not
+        integers.
         """
         require(
             (density is None) != (mass is None),
@@ -125,8 +128,10 @@ class MassProperties(AbstractShaped, Printable):
         """As ``from_mesh``, from a file (STL, OBJ, PLY, ...) read by trimesh.
 
         ``unit``: metres per unit of length of the file (0.001 for millimetres). Raises ImportError
-        without trimesh (extra ``mesh``), ValueError for an unreadable file or a bad mesh.
+        without trimesh (extra ``mesh``), ValueError for an unreadable file or a bad mesh,
+        TypeError or ValueError for a unit that is not a positive number.
         """
+        as_positive("unit", unit, hint="metres per unit of length of the file")
         vertices, faces = load_mesh(path)
         return cls.from_mesh(vertices * unit, faces, density=density, mass=mass)
 
@@ -301,8 +306,9 @@ def as_triangles(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarr
 def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:
     """``as_triangles`` for a closed, oriented surface.
 
-    Raises ValueError if the surface has holes or faces of opposite orientation, or (for concrete
-    vertices) does not enclose a positive volume.
+    Raises ValueError if the surface has holes, repeated faces or faces of opposite orientation, or
+    (for concrete vertices) does not enclose a positive volume or has an inverted shell that is not
+    the wall of a cavity.
     """
     vertices, faces = as_triangles(vertices, faces)
     _check_closed(faces)
@@ -315,6 +321,7 @@ def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray
             "that all faces are inverted (wind them counter-clockwise seen from outside: "
             "faces[:, ::-1]).",
         )
+        _check_shells(np.asarray(vertices, np.float64), faces)
     return vertices, faces
 
 
@@ -340,6 +347,58 @@ def _check_closed(faces: np.ndarray) -> None:
         f"the faces must be wound alike, got {wrong} of {len(used)} edges between faces of "
         "opposite orientation; some faces are inverted: reverse their vertex order.",
     )
+    if used.max() > 2:  # edges of repeated faces are used four times or more
+        _, which = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
+        orientation = np.sign(np.diff(faces.astype(np.int64), axis=1, append=faces[:, :1]))
+        net = np.bincount(which.ravel(), weights=orientation.prod(axis=1))
+        repeated = int((abs(net) > 1).sum())
+        require(
+            repeated == 0,
+            f"the mesh has {repeated} faces more than once, so that what they enclose would count"
+            " more than once: remove the repeated faces.",
+        )
+
+
+def _check_shells(vertices: np.ndarray, faces: np.ndarray) -> None:
+    """ValueError unless every inverted shell of the meshes (..., v, 3) lies inside of another."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = vertices.shape[-2]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]]).astype(np.int64)
+    graph = coo_array((np.ones(len(edges), bool), tuple(edges.T)), (count, count))
+    _, shell = np.unique(connected_components(graph)[1][faces[:, 0]], return_inverse=True)
+    shells = int(shell.max()) + 1
+    if shells == 1:
+        return
+    for mesh in vertices.reshape(-1, count, 3):
+        corners = mesh[faces] - mesh.mean(axis=0)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        volumes = np.bincount(shell, weights=np.sum(corners[:, 0] * normals, axis=-1))
+        # flat shells, whose volume is a rounding error, do not matter
+        negative = np.flatnonzero(volumes < -1e-9 * abs(volumes).sum()).tolist()
+        inverted = [k for k in negative if not _is_cavity(k, corners, normals, shell)]
+        require(
+            not inverted,
+            f"{len(inverted)} of {shells} separate shells of the mesh are inverted and not the wall"
+            " of a cavity inside of another one, so that their volume would be subtracted: reverse"
+            " the vertex order of their faces.",
+        )
+
+
+def _is_cavity(k: int, corners: np.ndarray, normals: np.ndarray, shell: np.ndarray) -> bool:
+    """Whether the inverted shell ``k`` lies inside of the others, by their winding number."""
+    areas = np.where(shell == k, np.linalg.norm(normals, axis=-1), -1)
+    largest = int(np.argmax(areas))
+    # a point between the shell and the others if it touches one of them: normals point inwards
+    inwards = 1e-6 * normals[largest] / np.sqrt(areas[largest])
+    a, b, c = np.moveaxis(corners[shell != k] - corners[largest].mean(axis=0) - inwards, 1, 0)
+    # solid angles of triangles: Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30 (1983)
+    la, lb, lc = (np.linalg.norm(x, axis=-1) for x in (a, b, c))
+    dots = [np.sum(x * y, axis=-1) for x, y in ((a, b), (b, c), (c, a))]
+    below = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+    angles = 2 * np.arctan2(np.sum(a * np.cross(b, c), axis=-1), below)
+    return bool(angles.sum() > 2 * np.pi)
 
 
 @jax.jit  # outside jit too, one program for all operations

@@ -57,6 +57,8 @@ def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, 
     if not Path(path).is_file():
         raise FileNotFoundError(f"no such file: {path}")
     name = Path(path).name
+    if _root_tag(path) == "robot":  # MuJoCo reads URDF too, but merges links with fixed joints
+        raise ValueError(f"{name} is a URDF file, which is read by from_urdf.")
     try:
         model: Any = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -71,6 +73,14 @@ def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, 
     rotation_matrix = Rotation.from_quat(model_body.iquat, scalar_first=True).as_matrix()
     tensor = rotation_matrix @ np.diag(model_body.inertia) @ rotation_matrix.T
     return float(model_body.mass[0]), np.array(model_body.ipos), tensor
+
+
+def _root_tag(path: str | PathLike[str]) -> str | None:
+    try:
+        with open(path, "rb") as file:
+            return next(ElementTree.iterparse(file, events=("start",)))[1].tag
+    except (ElementTree.ParseError, LookupError, StopIteration):  # MuJoCo names the mistake
+        return None
 
 
 def _listed(names: Any) -> str:

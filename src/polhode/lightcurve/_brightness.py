@@ -271,12 +271,17 @@ class Convex(NamedTuple):
 
     @classmethod
     def from_mesh(cls, vertices: ArrayLike, faces: ArrayLike) -> "Convex":
-        """A closed triangle mesh (v, 3), (f, 3); shadows of the mesh on itself are neglected."""
+        """A closed triangle mesh (v, 3), (f, 3); shadows of the mesh on itself are neglected.
+
+        Triangles without an area, such as between vertices on one line, have the normal zero.
+        """
         vertices, faces = check_mesh(vertices, faces)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         across = jnp.cross(b - a, c - a)
-        size = jnp.sqrt(jnp.sum(across * across, axis=-1))
-        return cls(across / size[:, None], size / 2)
+        square = jnp.sum(across * across, axis=-1)
+        has_area = square > 0
+        size = jnp.sqrt(jnp.where(has_area, square, 1))
+        return cls(across / size[:, None], jnp.where(has_area, size / 2, 0))
 
     @classmethod
     def from_ellipsoid(cls, axes: Float[Array, "*b 3"], count: int = 1000) -> "Convex":

@@ -92,7 +92,8 @@ class LightCurve(NamedTuple):
         if np.abs(magnitude).max() > _FAINTEST:
             raise ValueError(
                 f"magnitudes reach {magnitude[np.argmax(np.abs(magnitude))]:.5g}: these are fluxes"
-                " or counts. Give -2.5 log10(flux), or name the column flux."
+                " or counts, or placeholders such as 99.99 of missing values. Give"
+                " -2.5 log10(flux), or name the column flux; leave points without a value out."
             )
         if np.ptp(t) == 0:
             raise ValueError(f"all {t.size} times are {t[0]}: a light curve must span some time.")

@@ -147,18 +147,23 @@ def samples(
 ) -> Samples:
     """Arrays to plot: times (..., T) s, body rates (..., T, 3) rad/s, attitudes (..., T, 4).
 
-    Leading axes are flattened to one axis of bodies. Raises ValueError for shapes that do not fit
-    together.
+    Leading axes are flattened to one axis of bodies; quaternions are normalised. Raises ValueError
+    for shapes that do not fit together.
     """
     omega = np.asarray(omega_body, np.float64)
     if omega.ndim < 2 or omega.shape[-1] != 3:
         raise ValueError(f"omega_body must have shape (..., T, 3), got {omega.shape}.")
+    if omega.size == 0:
+        raise ValueError(
+            f"a figure needs one body and one sample or more, got rates of shape {omega.shape}."
+        )
     lead, samples = omega.shape[:-2], omega.shape[-2]
 
     def flat(name, value, core):
         value = np.asarray(value, np.float64)
         if value.shape[value.ndim - len(core) :] != core:
-            raise ValueError(f"{name} must have shape (..., {core}), got {value.shape}.")
+            shape = ", ".join(map(str, core))
+            raise ValueError(f"{name} must have shape (..., {shape}), got {value.shape}.")
         return np.broadcast_to(value, lead + core).reshape(-1, *core)
 
     energy = tensor = None
@@ -173,10 +178,15 @@ def samples(
             )
             / 2
         )
+    attitudes = None
+    if wxyz is not None:
+        attitudes = flat("wxyz", wxyz, (samples, 4))
+        with np.errstate(invalid="ignore"):  # zeros in place of a missing attitude become NaN
+            attitudes = attitudes / np.linalg.norm(attitudes, axis=-1, keepdims=True)
     return Samples(
         flat("ts", ts, (samples,)),
         omega.reshape(-1, samples, 3),
-        None if wxyz is None else flat("wxyz", wxyz, (samples, 4)),
+        attitudes,
         tensor,
         energy,
     )
@@ -192,13 +202,16 @@ def as_samples(what: Trajectory | Samples) -> Samples:
         )
     inertia = what.scene.inertia  # a variable inertia has no single ellipsoid to draw
     constant = inertia if isinstance(inertia, Inertia) else None
-    result = samples(what.ts, what.omega_body, what._wxyz, constant)
+    result = samples(what.ts, what.omega_body, inertia=constant)
     has_energy = what.scene.potential is None or what._wxyz is not None
     energy = np.asarray(what.energy, np.float64).reshape(result.ts.shape) if has_energy else None
     momentum = None
     if what.scene.rotors is not None or constant is None:
         momentum = np.asarray(what.momentum_body, np.float64).reshape(result.omega_body.shape)
-    return dataclasses.replace(result, energy=energy, momentum=momentum)
+    wxyz = what._wxyz
+    if wxyz is not None:  # as they are, without normalisation
+        wxyz = np.asarray(wxyz, np.float64).reshape(*result.ts.shape, 4)
+    return dataclasses.replace(result, wxyz=wxyz, energy=energy, momentum=momentum)
 
 
 def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:

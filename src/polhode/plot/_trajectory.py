@@ -465,9 +465,10 @@ def animate(
 
     Every body is drawn as the homogeneous box with its moments, each in its own panel (up to 64
     bodies; `bodies` selects them). The motion from first to last time is shown in `seconds`, with
-    attitudes interpolated between samples. `path` ending in .gif, .mp4 or .html: the file to write,
-    atomically; gif needs pillow, mp4 the program ffmpeg. Raises ValueError for another ending,
-    RuntimeError if the writer is missing.
+    attitudes interpolated between samples; all panels show the same time, and a body stands still
+    before its first and after its last sample. `path` ending in .gif, .mp4 or .html: the file to
+    write, atomically; gif needs pillow, mp4 the program ffmpeg. Raises ValueError for another
+    ending, RuntimeError if the writer is missing.
     """
     from matplotlib.animation import FuncAnimation
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -479,12 +480,14 @@ def animate(
     numbers = [pick(data, number)[1] for number in numbers]
     if path is not None:
         _check_writer(Path(path))
-    scale = Scale.of(np.ptp(data.ts)) if scale is None else scale
+    ts = data.ts[numbers]
+    scale = Scale.of(np.ptp(ts)) if scale is None else scale
     wxyz = data.need("wxyz", "an animation")
     boxes = [_box(tensor) for tensor in data.need("tensor", "an animation")[numbers]]
     frames = max(2, round(fps * seconds))
-    times = np.linspace(data.ts[numbers, 0], data.ts[numbers, -1], frames, axis=-1)
-    turns = [_interpolate(times[i], data.ts[b], wxyz[b]) for i, b in enumerate(numbers)]
+    times = np.linspace(ts.min(), ts.max(), frames)
+    times = times[::-1] if (ts[:, 0] > ts[:, -1]).all() else times
+    turns = [_interpolate(times, data.ts[b], wxyz[b]) for b in numbers]
 
     columns = int(np.ceil(np.sqrt(len(numbers))))
     rows = -(-len(numbers) // columns)
@@ -507,7 +510,7 @@ def animate(
             turn = turns[index][frame]
             solid.set_verts((boxes[index] @ turn.T)[_FACES])
             solid.set_facecolor(_shade(turn, boxes[index]))
-        title.set_text(f"t = {times[0][frame] / scale.seconds:.2f} {scale.time}")
+        title.set_text(f"t = {times[frame] / scale.seconds:.2f} {scale.time}")
         return [*solids, title]
 
     draw(0)
