@@ -19,6 +19,7 @@ from polhode.fit._numerics import inverse, svd
 from polhode.fit._options import FitOptions, Gyroscope, Huber, noise_is_trusted
 from polhode.fit._recording import (
     Recording,
+    is_measured,
     require_channel,
     turns_between_samples,
     turns_of_rates,
@@ -158,8 +159,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         first = linear.shared.shape[-1] - _count_after_motion(parameters) - factors.size
         sizes = jnp.ones(linear.shared.shape[-1], dtype).at[:count].set(size)
         sizes = sizes.at[first : first + factors.size].divide(factors)
-        linear = linear._replace(shared=linear.shared * sizes[None, None])
-        solution = dataclasses.replace(solution, linear=linear)
+        solution = dataclasses.replace(solution, linear=linear.scaled(sizes))
     determination = determination_of(solution, recording, noise_is_trusted(options))
     covariance, null = determination.covariance, determination.null
 
@@ -358,11 +358,8 @@ def has_outliers(residuals: Array, recording: Recording, robust: Any) -> Array:
     """
     if robust is not None:
         return jnp.asarray(False)
-    measured = (recording.present > 0)[..., None] & jnp.ones(residuals.shape, bool)
-    if recording.saturated is not None:
-        # The rates are the first three channels. Saturated ones are excluded: their one-sided
-        # residuals may be zero.
-        measured = measured.at[..., :3].set(measured[..., :3] & (recording.saturated == 0))
+    # without saturated readings, whose one-sided residuals may be zero
+    measured = is_measured(recording, residuals.shape[-1])
     size = jnp.where(measured, jnp.abs(residuals), jnp.nan)
     scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
     deviation = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from polhode.fit._numerics import eigh
-from polhode.fit._recording import Recording, size_of_data
-from polhode.fit._residuals import prior_of
+from polhode.fit._recording import Recording, is_measured, size_of_data
+from polhode.fit._residuals import prior_of, square_sum
 from polhode.fit._solve import Solution
 
 # Component of a quantity along null directions, relative to it, above which it is undetermined.
@@ -63,8 +63,9 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     covariance of the others is the pseudo-inverse of their information. Null directions then follow
     from the data alone, whatever the prior, and in single precision too.
     """
-    linear = solution.linear
-    information = linear.information()
+    linear, robust = solution.linear, solution.model.robust
+    weights = None if robust is None else _expected_weights(solution, recording, trust_noise)
+    information = linear.information(weights)
     dtype = information.dtype
     has_prior, precision = _priors(solution, recording)
     free_indices = np.flatnonzero(~has_prior)
@@ -78,8 +79,8 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     covariance = (vectors * inverse_values[None]) @ vectors.T / safe[:, None] / safe[None]
     null = NullSpace(jnp.where(determined, 0, 1)[None] * vectors / safe[:, None], 1 / safe)
     count = jnp.sum(determined).astype(dtype)
-    square = jnp.sum(linear.residuals**2)
     total = size_of_data(recording, linear.residuals.shape[-1])
+    square = square_sum(linear.residuals, total, robust)
     if not has_prior.any():
         noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
         variance = jnp.asarray(1, dtype) if trust_noise else noise**2
@@ -130,6 +131,27 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     )
     with_prior = information.at[with_prior_index, with_prior_index].add(precision * variance)
     return Determination(with_prior, full_covariance, full_null, jnp.sum(~determined), noise)
+
+
+def _expected_weights(
+    solution: Solution, recording: Recording, trust_noise: bool
+) -> Float[Array, "r c"]:
+    """Information of a residual with a robust loss over that of normal noise alone, by channel.
+
+    The covariance of an M-estimator is that of least squares times E(psi^2) / E(psi')^2, psi the
+    derivative of the loss (P. J. Huber, Robust Statistics, 1981, section 7.6). Expectations: psi'
+    is the part of the residuals within the threshold, which have the variance of the noise.
+    """
+    residuals, robust = solution.linear.residuals, solution.model.robust
+    measured = is_measured(recording, residuals.shape[-1])
+    is_inner = measured & (jnp.abs(robust.inverse(residuals)) <= robust.threshold)
+    count, inner_count = (jnp.sum(x.astype(residuals.dtype), axis=1) for x in (measured, is_inner))
+    inner = jnp.where(count > 0, inner_count / jnp.where(count > 0, count, 1), 1)
+    total = jnp.sum(count)
+    variance = 1 if trust_noise else square_sum(residuals, total, robust) / total
+    outer_variance = robust.threshold**2 / jnp.where(variance > 0, variance, 1)
+    mean_square = inner * robust.inner_variance.astype(inner.dtype) + (1 - inner) * outer_variance
+    return inner**2 / mean_square
 
 
 def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array]:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, is_concrete, require
@@ -287,6 +288,12 @@ class Huber(eqx.Module):
         large_size = jnp.where(inside, self.threshold, size)
         outside = jnp.sqrt(2 * self.threshold * large_size - self.threshold**2)
         return jnp.where(inside, residual, jnp.sign(residual) * outside)
+
+    @property
+    def inner_variance(self) -> Array:
+        """Variance of standard normal deviates within the threshold."""
+        k = jnp.asarray(self.threshold, float)
+        return 1 - 2 * k * norm.pdf(k) / (2 * norm.cdf(k) - 1)
 
     def inverse(self, reduced: Array) -> Array:
         """The residual that the loss maps to ``reduced``."""

@@ -198,6 +198,16 @@ def size_of_data(recording: Recording, channels: int) -> Array:
     return count - jnp.sum(jnp.abs(recording.saturated) * recording.present[..., None])
 
 
+def is_measured(recording: Recording, channels: int) -> Array:
+    """Whether each value (..., T, channels) is measured: neither a gap nor a saturated reading."""
+    present = recording.present[..., None] > 0
+    if recording.saturated is None:
+        return jnp.repeat(present, channels, axis=-1)
+    # the rates are the first three channels
+    others = jnp.repeat(present, channels - 3, axis=-1)
+    return jnp.concatenate([present & (recording.saturated == 0), others], axis=-1)
+
+
 @jax.jit
 def interpolate_gaps(
     times: Float[Array, "*b t"], present: Float[Array, "*b t"], values: Array

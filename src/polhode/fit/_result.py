@@ -69,7 +69,8 @@ class Fit(eqx.Module):
       the pseudo-inverse of ``information`` (..., p, p), which includes the calibration, times
       ``noise**2`` where the level of the noise was estimated.
     - ``null_count`` (...): number of directions of the unknowns that the data do not show.
-    - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
+    - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi); with
+      a robust loss, of those within its threshold.
     - ``whiteness`` (...): probability of autocorrelations as large as observed, for independent
       residuals (Ljung-Box).
     - ``rms`` (...): root mean square of the residual rates [rad/s]; NaN without rates.
