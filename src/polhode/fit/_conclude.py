@@ -21,6 +21,7 @@ from polhode.fit._recording import (
     Recording,
     is_measured,
     require_channel,
+    size_of_data,
     turns_between_samples,
     turns_of_rates,
 )
@@ -254,7 +255,10 @@ def _fit_of(
     """The ``Fit``: with the ``findings`` of its kind of fit and those common to all fits."""
     linear, parameters, model = solution.linear, solution.parameters, solution.model
     parts = residuals_by_channel(linear, recording, options.robust)
-    whiteness = whiteness_of(linear.residuals, recording.present)
+    size = size_of_data(recording, linear.residuals.shape[-1])
+    whiteness = whiteness_of(
+        linear.residuals, recording.present, determination.count / jnp.maximum(size, 1)
+    )
     findings = findings | {
         Finding.STEP_LIMIT: ~solution.stopped,
         Finding.NOT_WHITE: whiteness < 1e-4,
@@ -427,16 +431,30 @@ def residuals_by_channel(
 
 
 @partial(jax.jit, static_argnames="lags")  # outside jit too, one program for all operations
-def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
-    """Ljung-Box probability of the first autocorrelations of all channels together."""
+def whiteness_of(
+    residuals: Array, present: Array, unknown_part: Array | float = 0.0, lags: int = 5
+) -> Array:
+    """Ljung-Box probability of the first autocorrelations of all channels together.
+
+    ``unknown_part``: number of fitted unknowns over that of the residuals. Lags up to a quarter of
+    the samples count. Means and variances of the autocorrelations of few independent samples are
+    those of J.-M. Dufour and R. Roy, Biometrika 72 (1985) 649. The unknowns fit part of the noise,
+    which correlates the residuals: by as much as a low-pass filter of ``unknown_part`` of the band
+    would that was subtracted. Its sign depends on the motion, so that it is a shift of unknown sign
+    (noncentral chi-square). In 1e5 draws of 8 to 200 samples with 0 to 11 unknowns, at most 0.04 %
+    had a probability below 0.01 %.
+    """
+    dtype = residuals.dtype
     total = jnp.sum(present, axis=-1)[:, None]
-    # recordings that only pad a batch have no samples and do not contribute
-    total = jnp.where(total > 0, total, 1)
+    is_used = total > 3
+    # other recordings, such as those that only pad a batch, do not contribute
+    total = jnp.where(is_used, total, 4)
     residuals = (residuals - (jnp.sum(residuals, axis=1) / total)[:, None]) * present[..., None]
     power = jnp.sum(residuals**2, axis=1)
     safe = jnp.where(power > 0, power, 1)
     later = jnp.pad(residuals, ((0, 0), (0, lags), (0, 0)))
     later_present = jnp.pad(present, ((0, 0), (0, lags)))
+    unknown_part = jnp.minimum(jnp.asarray(unknown_part, dtype), 0.9)
 
     def statistic_at(lag):
         lagged, present_too = (
@@ -445,16 +463,30 @@ def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
         )
         # pairs of samples that are both present: without gaps the number of samples minus the lag
         pairs = jnp.sum(present * present_too, axis=1)[:, None]
+        k = lag.astype(dtype)
+        counted = is_used & (pairs > 0) & (k <= jnp.maximum(total / 4, 1))
         correlation = jnp.sum(residuals * lagged, axis=1) / safe
-        terms = correlation**2 / jnp.where(pairs > 0, pairs, jnp.inf) * total * (total + 2)
-        return jnp.sum(terms), jnp.sum(pairs > 0).astype(residuals.dtype)
+        mean = -pairs / (total * (total - 1))
+        variance = total**4 - (k + 3) * total**3 + 3 * k * total**2
+        variance = variance + 2 * k * (k + 1) * total - 4 * k**2
+        variance = variance / ((total + 1) * (total * (total - 1)) ** 2)
+        variance = jnp.where(counted, variance * pairs / (total - k), jnp.inf)
+        shift = unknown_part * jnp.sinc(k * unknown_part) / (1 - unknown_part) * pairs / total
+        counts = jnp.sum(counted.astype(dtype))
+        return jnp.sum((correlation - mean) ** 2 / variance), jnp.sum(shift**2 / variance), counts
 
-    statistics, counted = jax.lax.map(statistic_at, jnp.arange(1, lags + 1))
-    statistic = jnp.sum(statistics)
+    parts = jax.lax.map(statistic_at, jnp.arange(1, lags + 1))
+    statistic, shift, counted = (jnp.sum(x) for x in parts)
+    channels = residuals.shape[-1]
+    degrees, shift = channels * counted, channels * shift
+    has_pairs, degrees = degrees > 0, jnp.maximum(degrees, 1)
+    # a chi-square variable of the same mean and variance; that of few samples is larger by 4 / T
+    samples = jnp.sum(jnp.where(is_used, total, 0))
+    samples = samples / jnp.maximum(jnp.sum(is_used.astype(dtype)), 1)
+    factor = (degrees + 2 * shift) / (degrees + shift) * (1 + 4 / jnp.maximum(samples, 1))
+    statistic, degrees = statistic / factor, (degrees + shift) / factor
     # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact function
     # would take longer to compile than the rest of this one.
-    degrees = residuals.shape[-1] * jnp.sum(counted)
-    has_pairs, degrees = degrees > 0, jnp.maximum(degrees, 1)
     spread = 2 / (9 * degrees)
     probability = norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)
     return jnp.where(has_pairs, probability, 1)

@@ -47,13 +47,14 @@ class NullSpace(eqx.Module):
 class Determination(NamedTuple):
     """How far the data determine p unknowns: ``information`` and ``covariance`` (p, p); ``null``
     and the number ``null_count`` of its directions; ``noise``: standard deviation of the residuals
-    over the assumed one."""
+    over the assumed one; ``count``: number of unknowns that the data determine."""
 
     information: Array
     covariance: Array
     null: NullSpace
     null_count: Array
     noise: Array
+    count: Array
 
 
 def determination_of(solution: Solution, recording: Recording, trust_noise: bool) -> Determination:
@@ -84,7 +85,8 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     if not has_prior.any():
         noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
         variance = jnp.asarray(1, dtype) if trust_noise else noise**2
-        return Determination(information, covariance * variance, null, jnp.sum(~determined), noise)
+        null_count = jnp.sum(~determined)
+        return Determination(information, covariance * variance, null, null_count, noise, count)
     with_prior_index = np.flatnonzero(has_prior)
     cross = information[np.ix_(free_indices, with_prior_index)]
     width = precision**-0.5
@@ -99,12 +101,8 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     # Degrees of freedom: an unknown with a prior counts by the fraction that the data determine.
     # That depends on the noise; one fixed-point step suffices.
     noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
-    noise = jnp.sqrt(
-        square
-        / jnp.maximum(
-            total - count - jnp.sum(gained_information / (gained_information + noise**2)), 1
-        )
-    )
+    count = count + jnp.sum(gained_information / (gained_information + noise**2))
+    noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
     variance = jnp.asarray(1, dtype) if trust_noise else noise**2
     # Posterior covariance of the calibration: 1 / (information / variance + 1) by eigenvectors.
     spread = (
@@ -130,7 +128,8 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
         unit.at[free_indices].set(null.unit).at[with_prior_index].set(width),
     )
     with_prior = information.at[with_prior_index, with_prior_index].add(precision * variance)
-    return Determination(with_prior, full_covariance, full_null, jnp.sum(~determined), noise)
+    null_count = jnp.sum(~determined)
+    return Determination(with_prior, full_covariance, full_null, null_count, noise, count)
 
 
 def _expected_weights(
