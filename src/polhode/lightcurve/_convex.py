@@ -31,6 +31,7 @@ from polhode.lightcurve._solutions import (
     ellipsoid_of,
     frequencies,
     momentum,
+    pole_std_of,
     same_periods,
 )
 
@@ -320,7 +321,7 @@ def _solution(
         pole=np.degrees(
             [np.arctan2(pole[1], pole[0]) % (2 * np.pi), np.arcsin(np.clip(pole[2], -1, 1))]
         ),
-        pole_std=float(np.degrees(np.linalg.norm(std[5:]))),
+        pole_std=pole_std_of(std[5:]),
         wxyz=wxyz,
         omega_body=unknowns[4:7],
         offsets=linear.offsets(body.values, old),
