@@ -22,6 +22,11 @@ from polhode._checks import (
 )
 from polhode.rotation import conjugate, multiply, normalise, wxyz_to_rotation_vector
 
+
+class RateUnitError(ValueError):
+    """Rates or times that are probably not in rad/s or s."""
+
+
 # rotation angle between samples [rad] above which a recording under-samples the motion
 _TURN_PER_SAMPLE = np.pi
 
@@ -360,11 +365,12 @@ def _check_rates(omega, times):
             f"omega_body of sample {place + 1} would turn the body by {worst[place]:.3g} rad within"
             " one interval between samples, more than half a turn: an outlier? Set its row to NaN."
         )
-    require(
-        turn <= _TURN_PER_SAMPLE,
-        f"omega_body turns the body by up to {turn.max():.3g} rad between samples, more than half "
-        "a turn; are the rates in deg/s (multiply by pi/180) or the times in ms (divide by 1000)?",
-    )
+    if np.any(turn > _TURN_PER_SAMPLE):
+        raise RateUnitError(
+            f"omega_body turns the body by up to {turn.max():.3g} rad between samples, more than "
+            "half a turn; are the rates in deg/s (multiply by pi/180) or the times in ms (divide by"
+            " 1000)?"
+        )
 
 
 def _noise(name, value, shape, dtype):
