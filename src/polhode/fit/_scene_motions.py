@@ -14,6 +14,7 @@ from polhode._scene import Scene, State, Table
 from polhode._simulate import simulate
 from polhode.fit._model import AbstractMotion, Predicted, entries_of, whole_of
 from polhode.fit._numerics import to_bounded, to_unbounded
+from polhode.frames import gyroscope
 from polhode.inertia import Inertia
 
 
@@ -30,7 +31,7 @@ def simulated(
     axes = jnp.asarray([1, 0, 0, 0])
     start = next(x for x in (wxyz, attitude, axes) if x is not None).astype(omega.dtype)
     trajectory = simulate(scene, State(start, omega), times, method, rtol=rtol, throw=False)
-    return Predicted(trajectory.omega_body, None, None if wxyz is None else trajectory.wxyz)
+    return Predicted(gyroscope(trajectory), None, None if wxyz is None else trajectory.wxyz)
 
 
 class SceneMotion(AbstractMotion):
