@@ -19,7 +19,7 @@ from polhode.lightcurve._brightness import (
     harmonics,
     moments_of,
 )
-from polhode.lightcurve._least_squares import stepped
+from polhode.lightcurve._least_squares import damped_steps, next_damping, stepped
 from polhode.lightcurve._nulls import Linear
 from polhode.lightcurve._solutions import (
     Described,
@@ -174,10 +174,8 @@ def refine(
 
     for _ in range(_STEPS):
         _, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
-        size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-        damped = matrix / size / size[:, None] + damping * np.eye(len(matrix))
-        step = -np.linalg.solve(damped, right / size) / size
-        step *= min(1.0, 0.5 / max(np.abs(np.r_[step[:2], step[5:]]).max(), 1e-30))
+        limited = np.delete(np.arange(len(matrix)), (2, 3, 4))  # all but the rates
+        (step,) = damped_steps(matrix[None], right[None], damping, limited)
         change = np.zeros((1, body.unknowns.shape[1] + 3))
         change[0, _MOTION], change[0, -3:] = step[:5], step[5:8]
         # ``stepped`` corrects the rates by derivatives of the periods, which do not exist at a
@@ -199,7 +197,7 @@ def refine(
         if better:
             body, coefficients = trial, coefficients + step[8:]
             (rest, slopes, open_area, by_open), chi2, cost = new, new_chi2, new_cost
-        damping = float(np.clip(damping * (0.2 if better else 5.0), 1e-9, 1e9))
+        damping = float(next_damping(damping, better))
         if quiet == 3:
             break
     data, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
