@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
+from polhode import plot
 from polhode._scene._scene import places_of
 from polhode.fit import FitOptions, Gyroscope, Recording
 from polhode.fit._scene_motions import LeafMotion
@@ -263,6 +264,8 @@ def test_an_inertia_tensor_is_fitted_by_its_six_entries():
     np.testing.assert_allclose(fit.derived(lambda v: (v[0] + v[0].T) / 2)[1], std, rtol=1e-6)
     row = fit.observability()[0]
     assert (row.quantity, row.shown, row.count) == ("inertia.full (6)", 5, 6)
+    labels = [x.get_text()[-6:] for x in plot.fit(fit, data).axes[4].get_xticklabels()]
+    assert labels == ["[0][0]", "[1][1]", "[2][2]", "[1][2]", "[2][0]", "[0][1]"]
     width[0, 1] = 0.2
     with pytest.raises(ValueError, match="symmetric"):
         ph.fit_scene(scene, data, free, prior_std=[width], options=options)
