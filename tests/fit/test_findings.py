@@ -84,6 +84,10 @@ def test_single_samples_far_off_are_outliers_and_runs_are_not():
     some = rest.copy()
     some[0, rng.choice(500, 8, replace=False), 1] += 15
     assert has_outliers(jnp.asarray(some), whole, None)
+    # many short recordings, in some of which all but one of the residuals are small by chance
+    short = stack([Recording.of(T[:6], RATES[:6])] * 80)
+    draws = jnp.asarray(np.random.default_rng(2).normal(size=(50, 80, 6, 3)))
+    assert not np.any(jax.vmap(lambda draw: has_outliers(draw, short, None))(draws))
     # with a robust fit
     assert not has_outliers(jnp.asarray(some), whole, object())
     # an incomplete model

@@ -356,8 +356,8 @@ def _calibration_strained(solution: Solution, recording: Recording) -> Array:
 def has_outliers(residuals: Array, recording: Recording, robust: Any) -> Array:
     """Whether isolated residuals (r, t, c) are outliers; False for fits with a robust loss.
 
-    An outlier is beyond five sigma (from the median of the absolute values) and its two neighbours
-    are within three: an incomplete model leaves runs of large residuals, not single ones. True for
+    An outlier is beyond five sigma (from the median of the absolute values, of each channel) and
+    its two neighbours are within three: an incomplete model leaves runs of large residuals, not single ones. True for
     at least three outliers that are 0.3 % of all residuals.
     """
     if robust is not None:
@@ -365,7 +365,9 @@ def has_outliers(residuals: Array, recording: Recording, robust: Any) -> Array:
     # without saturated readings, whose one-sided residuals may be zero
     measured = is_measured(recording, residuals.shape[-1])
     size = jnp.where(measured, jnp.abs(residuals), jnp.nan)
-    scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
+    # that of few samples may be small by chance: at least the one of all recordings
+    scale = jnp.maximum(*(jnp.nanmedian(size, axis=k, keepdims=True) for k in (1, (0, 1))))
+    scale = 1.4826 * scale
     deviation = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))
     padded_deviation = jnp.pad(deviation, ((0, 0), (1, 1), (0, 0)))
     is_isolated = (deviation > 5) & (padded_deviation[:, :-2] < 3) & (padded_deviation[:, 2:] < 3)
