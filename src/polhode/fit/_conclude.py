@@ -357,8 +357,8 @@ def has_outliers(residuals: Array, recording: Recording, robust: Any) -> Array:
     """Whether isolated residuals (r, t, c) are outliers; False for fits with a robust loss.
 
     An outlier is beyond five sigma (from the median of the absolute values, of each channel) and
-    its two neighbours are within three: an incomplete model leaves runs of large residuals, not single ones. True for
-    at least three outliers that are 0.3 % of all residuals.
+    its two neighbours are within three: an incomplete model leaves runs of large residuals, not
+    single ones. True for at least three outliers that are 0.3 % of all residuals.
     """
     if robust is not None:
         return jnp.asarray(False)
