@@ -9,6 +9,7 @@ import polhode as ph
 from polhode import plot
 from polhode._scene._scene import places_of
 from polhode.fit import FitOptions, Gyroscope, Recording
+from polhode.fit._conclude import _prior_disagrees
 from polhode.fit._scene_motions import LeafMotion
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
@@ -228,6 +229,13 @@ def test_bounds_and_priors_hold():
     row = fit.observability()[0]
     assert (row.shown, row.count, row.source) == (2, 3, "data and prior")
     assert "the prior" in fit.limit()
+    # a prior mean of twice the drag
+    start = ph.Scene(BODY, torque=ph.LinearDamping([0.2, 0.06, 0.02]))
+    narrow = [[0.01, 1.0, 1.0]]
+    free = lambda s: s.torque.c  # noqa: E731
+    wrong = ph.fit_scene(start, data, free, prior_std=narrow, options=options, rtol=1e-6)
+    assert wrong.findings() == ["prior disagrees"]
+    assert "prior disagrees" in wrong.limit()
 
 
 def test_a_tensor_has_six_unknowns_in_a_scene():
@@ -269,6 +277,27 @@ def test_an_inertia_tensor_is_fitted_by_its_six_entries():
     width[0, 1] = 0.2
     with pytest.raises(ValueError, match="symmetric"):
         ph.fit_scene(scene, data, free, prior_std=[width], options=options)
+
+
+@pytest.mark.parametrize(
+    ("measured", "std", "named"),
+    [
+        (0.1, 0.05, False),
+        (0.1, 0.001, True),
+        (0.14, 0.01, False),
+        (0.1, 0.01, True),
+        (-0.2, 0.05, True),
+    ],
+)
+def test_a_prior_that_contradicts_the_data_is_named(measured, std, named):
+    """A drag of 0.15 +- 0.01 and data of ``measured`` +- ``std``: the estimate is their mean."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
+    widths = (jnp.full(3, 0.01),)
+    motion = LeafMotion(scene, places_of(scene, lambda s: s.torque.c), widths=widths)
+    variance = 1 / (std**-2 + 0.01**-2)
+    value = variance * (measured * std**-2 + 0.15 * 0.01**-2)
+    both = jnp.full(3, value), jnp.full(3, variance**0.5)
+    assert bool(_prior_disagrees(motion, [both[0]], [both[1]])) == named
 
 
 @pytest.mark.slow  # 25 s of compilation; faster: test_bounds_and_priors_hold

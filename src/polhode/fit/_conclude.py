@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from polhode._scene import State
 from polhode.fit._determination import Determination, determination_of
 from polhode.fit._findings import Finding
-from polhode.fit._model import Parameters, entries_of, is_nearly_flat, whole_of
+from polhode.fit._model import AbstractMotion, Parameters, entries_of, is_nearly_flat, whole_of
 from polhode.fit._numerics import inverse, svd
 from polhode.fit._options import FitOptions, Gyroscope, Huber, noise_is_trusted
 from polhode.fit._recording import (
@@ -225,6 +225,7 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))),
         Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
         Finding.AT_BOUND: motion.at_bound(parameters.motion),
+        Finding.PRIOR_DISAGREES: _prior_disagrees(motion, parameters.motion, std.motion),
     }
     return _fit_of(
         solution,
@@ -350,6 +351,20 @@ def _calibration_strained(solution: Solution, recording: Recording) -> Array:
         if name != "motion" and precision is not None:
             value = getattr(solution.parameters, name)
             is_far = is_far | jnp.any(value**2 * precision > 3.5**2)
+    return is_far
+
+
+def _prior_disagrees(motion: AbstractMotion, values: list[Array], std: list[Array]) -> Array:
+    """Whether a value is farther from its prior mean than prior and data explain.
+
+    With the prior's variance v and that of the fit, p, the variance of the difference is v - p.
+    """
+    is_far = jnp.asarray(False)
+    for value, mean, spread, prior in zip(values, motion.start(), std, motion.prior_std()):
+        if prior is not None:
+            # at least a tenth of the prior's, below which the linear theory of the fit is not exact
+            explained = jnp.sqrt(jnp.maximum(prior**2 - spread**2, 1e-2 * prior**2))
+            is_far = is_far | jnp.any(jnp.abs(value - mean) > 3.5 * explained)
     return is_far
 
 

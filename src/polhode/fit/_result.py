@@ -18,6 +18,7 @@ from polhode._checks import ArrayLike, require
 from polhode._scene import Scene, State
 from polhode.fit._determination import NullSpace
 from polhode.fit._findings import (
+    MODEL_FLAWS,
     SCALE_UNKNOWN,
     SCENE_WARNINGS,
     UNUSABLE,
@@ -290,15 +291,9 @@ class Fit(eqx.Module):
 
     def limit(self, body: int = 0) -> str:
         """What limits the result of one body, in one sentence."""
-        flags = set(self._flags(body))
-        model = flags & {Finding.NOT_FINITE, Finding.STEP_LIMIT, Finding.AXES_DISAGREE}
-        model |= flags & {Finding.POOR, Finding.OUTLIERS, Finding.NOT_WHITE, Finding.CALIBRATION}
-        if model:
-            words = ", ".join(
-                str(flag.name).lower().replace("_", " ")
-                for flag in self._flags(body)
-                if flag in model
-            )
+        flaws = [flag for flag in self._flags(body) if flag & MODEL_FLAWS]
+        if flaws:
+            words = ", ".join(str(flag.name).lower().replace("_", " ") for flag in flaws)
             return f"the model, which does not explain the readings ({words})"
         if self._inertia is not None:
             std = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
