@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from polhode.fit._numerics import eigh
+from polhode.fit._options import Huber
 from polhode.fit._recording import Recording, is_measured, size_of_data
 from polhode.fit._residuals import prior_of, square_sum
 from polhode.fit._solve import Solution
@@ -65,7 +66,9 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     from the data alone, whatever the prior, and in single precision too.
     """
     linear, robust = solution.linear, solution.model.robust
-    weights = None if robust is None else _expected_weights(solution, recording, trust_noise)
+    residuals, weights = linear.residuals, None
+    if robust is not None:
+        weights = _expected_weights(residuals, recording, robust, trust_noise)
     information = linear.information(weights)
     dtype = information.dtype
     has_prior, precision = _priors(solution, recording)
@@ -80,8 +83,8 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     covariance = (vectors * inverse_values[None]) @ vectors.T / safe[:, None] / safe[None]
     null = NullSpace(jnp.where(determined, 0, 1)[None] * vectors / safe[:, None], 1 / safe)
     count = jnp.sum(determined).astype(dtype)
-    total = size_of_data(recording, linear.residuals.shape[-1])
-    square = square_sum(linear.residuals, total, robust)
+    total = size_of_data(recording, residuals.shape[-1])
+    square = square_sum(residuals, total, robust)
     if not has_prior.any():
         noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
         variance = jnp.asarray(1, dtype) if trust_noise else noise**2
@@ -133,7 +136,7 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
 
 
 def _expected_weights(
-    solution: Solution, recording: Recording, trust_noise: bool
+    residuals: Array, recording: Recording, robust: Huber, trust_noise: bool
 ) -> Float[Array, "r c"]:
     """Information of a residual with a robust loss over that of normal noise alone, by channel.
 
@@ -141,7 +144,6 @@ def _expected_weights(
     derivative of the loss (P. J. Huber, Robust Statistics, 1981, section 7.6). Expectations: psi'
     is the part of the residuals within the threshold, which have the variance of the noise.
     """
-    residuals, robust = solution.linear.residuals, solution.model.robust
     measured = is_measured(recording, residuals.shape[-1])
     is_inner = measured & (jnp.abs(robust.inverse(residuals)) <= robust.threshold)
     count, inner_count = (jnp.sum(x.astype(residuals.dtype), axis=1) for x in (measured, is_inner))

@@ -218,6 +218,16 @@ class AbstractMotion(eqx.Module):
         return [None for _ in jax.tree.leaves(self.start())]
 
     @property
+    def entry_counts(self) -> list[int | None]:
+        """Number of entries of each unknown symmetric tensor, None for other arrays (static)."""
+        return [None for _ in jax.tree.leaves(self.start())]
+
+    def arrays_of(self, unknown: Any) -> list[Array]:
+        """The unknown arrays: of symmetric tensors all nine components."""
+        pairs = zip(jax.tree.leaves(unknown), self.entry_counts, strict=True)
+        return [x if n is None else whole_of(x, n) for x, n in pairs]
+
+    @property
     def scales(self) -> bool:
         """Whether ``over`` is implemented for the unknowns of this motion."""
         return not jax.tree.leaves(self.start())

@@ -12,7 +12,7 @@ from polhode._integrate import LiePoisson
 from polhode._method import AbstractMethod
 from polhode._scene import Scene, State, Table
 from polhode._simulate import simulate
-from polhode.fit._model import AbstractMotion, Predicted, entries_of, whole_of
+from polhode.fit._model import AbstractMotion, Predicted, entries_of
 from polhode.fit._numerics import to_bounded, to_unbounded
 from polhode.frames import gyroscope
 from polhode.inertia import Inertia
@@ -126,16 +126,10 @@ class LeafMotion(AbstractMotion):
 
     @property
     def entry_counts(self) -> list[int | None]:
-        """Number of entries of each unknown symmetric tensor, None for other arrays (static)."""
         parts = jax.tree.leaves(self.scene, is_leaf=lambda part: isinstance(part, Inertia))
         tensors = [id(part.full) for part in parts if isinstance(part, Inertia)]
         leaves = jax.tree.leaves(self.scene)
         return [6 if id(leaves[i]) in tensors else None for i in self.places]
-
-    def arrays_of(self, unknown: Sequence[Array]) -> list[Array]:
-        """The unknown arrays of the scene: of symmetric tensors all nine components."""
-        counts = self.entry_counts
-        return [x if n is None else whole_of(x, n) for x, n in zip(unknown, counts)]
 
     def fixes_scale(self) -> bool:
         return True
