@@ -84,6 +84,10 @@ def test_single_samples_far_off_are_outliers_and_runs_are_not():
     some = rest.copy()
     some[0, rng.choice(500, 8, replace=False), 1] += 15
     assert has_outliers(jnp.asarray(some), whole, None)
+    # many short recordings, in some of which all but one of the residuals are small by chance
+    short = stack([Recording.of(T[:6], RATES[:6])] * 80)
+    draws = jnp.asarray(np.random.default_rng(2).normal(size=(50, 80, 6, 3)))
+    assert not np.any(jax.vmap(lambda draw: has_outliers(draw, short, None))(draws))
     # with a robust fit
     assert not has_outliers(jnp.asarray(some), whole, object())
     # an incomplete model
@@ -108,12 +112,31 @@ def test_white_residuals_are_white_beside_gaps(gaps):
     residuals = rng.normal(size=(300, 1, 200, 3)) * present[..., None]
     found = jax.vmap(whiteness_of)(jnp.asarray(residuals), jnp.asarray(present))
     assert 3 <= int(jnp.sum(found < 0.05)) <= 30
-    assert 0.4 < float(jnp.median(found)) < 0.6
+    assert 0.4 < float(jnp.median(found)) < 0.65
     # a recording of a few samples, fewer than the lags
     short = np.zeros((2, 200))
     short[0], short[1, :5] = 1, 1
     wave = np.sin(0.3 * np.arange(200))[None, :, None] * np.ones((2, 200, 3)) * short[..., None]
     assert float(whiteness_of(jnp.asarray(wave), jnp.asarray(short))) < 1e-6
+
+
+@pytest.mark.parametrize("samples", [8, 12, 20])
+def test_few_residuals_of_a_correct_fit_are_white(samples):
+    """Residuals of 8 unknowns fitted to noise, of smooth functions of time; a wave is not white."""
+    rng = np.random.default_rng(samples)
+    time = np.arange(samples) / samples
+    frequencies, phases = rng.uniform(size=(2, 8, 3)) * [[[samples / 6]], [[1]]]
+    waves = np.cos(2 * np.pi * (frequencies[..., None] * time + phases[..., None]))
+    basis, _ = np.linalg.qr(waves.swapaxes(1, 2).reshape(8, -1).T)
+    noise = rng.normal(size=(20_000, 3 * samples))
+    residuals = (noise - (noise @ basis) @ basis.T).reshape(-1, 1, samples, 3)
+    part = 8 / (3 * samples)
+    probability = jax.vmap(lambda x: whiteness_of(x, jnp.ones((1, samples)), part))
+    found = probability(jnp.asarray(residuals))
+    assert np.mean(np.asarray(found) < 1e-4) < 1e-3
+    assert 0.4 < float(jnp.median(found)) < 0.9
+    wave = residuals[:200] + 3 * np.sin(2 * np.pi * time)[:, None]
+    assert samples < 20 or np.mean(np.asarray(probability(jnp.asarray(wave))) < 1e-4) > 0.9
 
 
 def test_spin_about_one_axis_agrees_with_attitudes_and_against_it_does_not():

@@ -111,7 +111,14 @@ def test_a_wheel_shows_the_size(tmp_path, capsys):
 
 def test_wrong_units_are_suspected(toss, capsys):
     assert main(["fit", str(toss), *NAMES]) == 2
-    assert "deg/s" in capsys.readouterr().err
+    assert "See --degrees" in capsys.readouterr().err
+
+
+def test_missing_columns_are_to_be_named_whatever_the_others_are_called(tmp_path, capsys):
+    rows = ["clock,gyro_x [deg/s],wy -> deg/s,gyro_z [deg/s]", *["0,0,0,0"] * 5]
+    (tmp_path / "toss.csv").write_text("\n".join(rows))
+    assert main(["fit", str(tmp_path / "toss.csv")]) == 2
+    assert capsys.readouterr().err.rstrip().endswith("Name them: --columns wy=COLUMN")
 
 
 @pytest.mark.parametrize(

@@ -37,8 +37,9 @@ from polhode.fit import (
     windows,
 )
 from polhode.fit._conclude import _axes_disagree
-from polhode.fit._model import base_of, free_columns
-from polhode.fit._solve import _bias_of_rates, _sensor_start
+from polhode.fit._determination import determination_of
+from polhode.fit._model import AbstractMotion, NoInertia, Predicted, base_of, free_columns
+from polhode.fit._solve import _bias_of_rates, _sensor_start, solve_fit
 from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
 
 TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])
@@ -392,6 +393,47 @@ def test_residuals_of_outliers_are_reported_as_measured():
     fit = fit_inertia(times, rates, omega_noise=0.01, options=options)
     assert float(np.abs(fit.residuals["omega"]).max()) == pytest.approx(50, abs=4)
     assert float(fit.rms) == pytest.approx(np.sqrt(0.01**2 + 0.5**2 / 483), rel=0.1)
+
+
+class ConstantRates(AbstractMotion):
+    """Constant rates, for tests of what does not depend on the motion."""
+
+    def start(self):
+        return None
+
+    def fixes_scale(self):
+        return True
+
+    def __call__(self, tensor, omega, wxyz, times, wheel, unknown, acceleration=True):
+        return Predicted(jnp.broadcast_to(omega, (*times.shape, 3)), None, None)
+
+
+@pytest.mark.parametrize("trusted", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_intervals_beside_gross_outliers(trusted):
+    """The mean of rates with 5 % outliers about x, 20 % about y, none about z: 1,000 draws."""
+    rng = np.random.default_rng(0)
+    errors = rng.normal(size=(1000, 1, 40, 3))
+    is_outlier = rng.random(errors.shape) < [0.05, 0.2, 0.0]
+    errors += 30 * is_outlier * rng.choice([-1, 1], errors.shape)
+    recording = Recording.of(np.arange(40.0), 0.01 * errors, omega_noise=0.01 if trusted else 0.012)
+    options = FitOptions(
+        motion=ConstantRates(),
+        unknown=NoInertia(),
+        robust=Huber(3.0),
+        gyroscope=Gyroscope.ideal(),
+        trust_noise=trusted,
+        max_starts=1,
+    )
+
+    def fit(recording):
+        solution = solve_fit(recording, options)
+        found = determination_of(solution, recording, trusted)
+        return solution.parameters.omega[0], jnp.diagonal(found.covariance), found.noise
+
+    mean, variance, noise = jax.jit(jax.vmap(fit))(recording)
+    rms = np.sqrt(np.mean(np.asarray(mean) ** 2 / np.asarray(variance), axis=0))
+    np.testing.assert_allclose(rms, 1, atol=0.1)
+    np.testing.assert_allclose(np.mean(noise), 1 if trusted else 0.01 / 0.012, rtol=0.05)
 
 
 def test_the_loss_of_large_residuals_has_an_inverse():

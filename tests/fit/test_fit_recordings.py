@@ -1,6 +1,7 @@
 """Fits of real tosses with known results and known pitfalls (skipped without the recordings)."""
 
 import csv
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -83,6 +84,28 @@ def test_a_recording_made_without_its_noise_is_told():
     bare = Recording(times, np.ones(20), np.stack([np.sin(times)] * 3, axis=-1))
     with pytest.raises(ValueError, match=r"no omega_noise: make it by Recording\.of"):
         fit_recordings([bare])
+
+
+def test_means_of_saturated_readings_are_bounds():
+    """Also those of blocks of which only some readings are at the limit."""
+    times = np.arange(200.0)
+    rates = 0.2 * np.sin(0.1 * times[:, None] + [0, 1, 2])
+    rates[:, 0] = np.clip(rates[:, 0], -0.15, 0.15)
+    recording = Recording.of(times, rates)
+    blocks = averaged(recording, 5)
+    readings = rates.reshape(40, 5, 3)
+    upper, lower = ((side * readings[..., 0] >= 0.15) for side in (1, -1))
+    partly = np.any(upper, axis=1) & ~np.all(upper, axis=1)
+    assert partly.sum() == 6
+    expected = np.any(upper, axis=1).astype(float) - np.any(lower, axis=1)
+    np.testing.assert_array_equal(blocks.saturated[:, 0], expected)
+    assert not np.any(blocks.saturated[:, 1:])
+    assert np.all(blocks.present == 1)
+    # with recordings in which limits were not searched, and with a block at both limits
+    assert stack([blocks, Recording.of(times[:20], rates[:20])]).saturated.shape == (2, 40, 3)
+    limits = jnp.zeros((200, 3)).at[8, 0].set(1).at[9, 0].set(-1)
+    both = averaged(dataclasses.replace(recording, saturated=limits), 5)
+    np.testing.assert_array_equal(both.present, np.arange(40) != 1)
 
 
 def test_gaps_of_the_wheel_are_bridged_and_remembered():

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import polhode as ph
+from polhode import plot
 from polhode._scene._scene import places_of
 from polhode.fit import FitOptions, Gyroscope, Recording
-from polhode.fit._model import LeafMotion
+from polhode.fit._conclude import _prior_disagrees
+from polhode.fit._scene_motions import LeafMotion
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
@@ -227,6 +229,75 @@ def test_bounds_and_priors_hold():
     row = fit.observability()[0]
     assert (row.shown, row.count, row.source) == (2, 3, "data and prior")
     assert "the prior" in fit.limit()
+    # a prior mean of twice the drag
+    start = ph.Scene(BODY, torque=ph.LinearDamping([0.2, 0.06, 0.02]))
+    narrow = [[0.01, 1.0, 1.0]]
+    free = lambda s: s.torque.c  # noqa: E731
+    wrong = ph.fit_scene(start, data, free, prior_std=narrow, options=options, rtol=1e-6)
+    assert wrong.findings() == ["prior disagrees"]
+    assert "prior disagrees" in wrong.limit()
+
+
+def test_a_tensor_has_six_unknowns_in_a_scene():
+    """Faster than the next test."""
+    tensor = np.array([[1.0, 0.1, -0.05], [0.1, 2.0, 0.02], [-0.05, 0.02, 2.5]])
+    scene = ph.Scene(ph.Inertia.from_tensor(tensor), torque=ph.LinearDamping(0.1))
+    motion = LeafMotion(scene, places_of(scene, lambda s: [s.torque.c, s.inertia.full]))
+    drag, entries = motion.start()
+    np.testing.assert_array_equal(entries, [1.0, 2.0, 2.5, 0.02, -0.05, 0.1])
+    assert motion.entry_counts == [None, 6]
+    np.testing.assert_array_equal(motion.arrays_of([drag, entries])[1], tensor)
+
+
+@pytest.mark.slow
+def test_an_inertia_tensor_is_fitted_by_its_six_entries():
+    """Opposite products are one unknown: finite deviations, one prior, and bounds of both."""
+    tensor = np.array([[1.0, 0.1, -0.05], [0.1, 2.0, 0.02], [-0.05, 0.02, 2.5]])
+    scene = ph.Scene(ph.Inertia.from_tensor(tensor), torque=ph.LinearDamping(0.1))
+    rates = noisy(5, ph.simulate(scene, STATE, TIMES).omega_body)
+    data = Recording.of(TIMES, rates, omega_noise=NOISE)
+    free = lambda s: [s.inertia.full]  # noqa: E731
+    width = np.full((3, 3), 0.5)
+    width[0, 1] = width[1, 0] = 1e-4
+    options = FitOptions(trust_noise=True, max_starts=1, gyroscope=Gyroscope.ideal())
+    fit = ph.fit_scene(scene, data, free, prior_std=[width], options=options, rtol=1e-6)
+    value, std = np.asarray(fit.values[0]), np.asarray(fit.std[0])
+    assert fit.findings() == []
+    assert np.all(std < 0.1)
+    assert np.all(np.abs(value - tensor) < 4 * std)
+    assert std[0, 1] == pytest.approx(1e-4, rel=0.01)  # the prior decides
+    np.testing.assert_array_equal(std, std.T)
+    np.testing.assert_array_equal(fit.scene.inertia.full, value)
+    np.testing.assert_allclose(fit.derived(lambda v: v[0])[1], std, rtol=1e-6)
+    np.testing.assert_allclose(fit.derived(lambda v: (v[0] + v[0].T) / 2)[1], std, rtol=1e-6)
+    row = fit.observability()[0]
+    assert (row.quantity, row.shown, row.count) == ("inertia.full (6)", 5, 6)
+    labels = [x.get_text()[-6:] for x in plot.fit(fit, data).axes[4].get_xticklabels()]
+    assert labels == ["[0][0]", "[1][1]", "[2][2]", "[1][2]", "[2][0]", "[0][1]"]
+    width[0, 1] = 0.2
+    with pytest.raises(ValueError, match="symmetric"):
+        ph.fit_scene(scene, data, free, prior_std=[width], options=options)
+
+
+@pytest.mark.parametrize(
+    ("measured", "std", "named"),
+    [
+        (0.1, 0.05, False),
+        (0.1, 0.001, True),
+        (0.14, 0.01, False),
+        (0.1, 0.01, True),
+        (-0.2, 0.05, True),
+    ],
+)
+def test_a_prior_that_contradicts_the_data_is_named(measured, std, named):
+    """A drag of 0.15 +- 0.01 and data of ``measured`` +- ``std``: the estimate is their mean."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
+    widths = (jnp.full(3, 0.01),)
+    motion = LeafMotion(scene, places_of(scene, lambda s: s.torque.c), widths=widths)
+    variance = 1 / (std**-2 + 0.01**-2)
+    value = variance * (measured * std**-2 + 0.15 * 0.01**-2)
+    both = jnp.full(3, value), jnp.full(3, variance**0.5)
+    assert bool(_prior_disagrees(motion, [both[0]], [both[1]])) == named
 
 
 @pytest.mark.slow  # 25 s of compilation; faster: test_bounds_and_priors_hold

@@ -130,6 +130,14 @@ def test_axes_that_slip_are_interpolated_by_the_rates_at_which_they_rotate(tumbl
     assert apart.max() < 1e-10
     slip = k * np.cross(y[8, 4:], omega[8])
     np.testing.assert_allclose(frame.omega_body(times[8]), omega[8] + slip, rtol=1e-9)
+    # sensors rotate with the axes, as the path of the accelerometer in space shows
+    made = ph.Trajectory(jnp.asarray(times), wxyz, omega, tumble.status, tumble.steps, scene)
+    np.testing.assert_allclose(gyroscope(made)[8], omega[8] + slip, rtol=1e-12)
+    path = np.asarray(rotation.rotate(wxyz, jnp.broadcast_to(POSITION, (161, 3))))
+    stencil = np.array([1 / 90, -3 / 20, 3 / 2, -49 / 18, 3 / 2, -3 / 20, 1 / 90])
+    expected = stencil @ path[5:12] / (times[1] - times[0]) ** 2
+    reading = rotation.rotate(wxyz[8], accelerometer(made, POSITION)[8])
+    np.testing.assert_allclose(reading, expected, atol=1e-6)
 
 
 def test_a_torqued_body_and_a_batch_of_bodies():

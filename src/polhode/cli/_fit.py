@@ -256,7 +256,8 @@ def _exit_code(result: Any, allow_undetermined: bool) -> int:
 
 
 def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
-    from polhode.fit._csv import load_recording
+    from polhode.fit._csv import MissingColumnsError, load_recording
+    from polhode.fit._recording import RateUnitError
 
     try:
         with usage_errors(path, ".csv", _EXPECTED):
@@ -268,12 +269,11 @@ def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
                 noise=options.noise or 1.0,
             )
     except UsageError as error:
-        hint = ""
-        if "deg/s" in str(error) and not (options.degrees and options.milliseconds):
+        hint, cause = "", error.__cause__
+        if isinstance(cause, RateUnitError) and not (options.degrees and options.milliseconds):
             hint = " See --degrees and --milliseconds."
-        elif "requested columns" in str(error):
-            missing = [role for role in _ROLES if f"{role} -> " in str(error)]
-            hint = " Name them: --columns " + " ".join(f"{role}=COLUMN" for role in missing)
+        elif isinstance(cause, MissingColumnsError):
+            hint = " Name them: --columns " + " ".join(f"{role}=COLUMN" for role in cause.roles)
         first, end, lines = str(error).partition("\n")
         raise UsageError(f"{first}{hint}{end}{lines}") from error
 

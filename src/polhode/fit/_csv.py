@@ -12,6 +12,12 @@ import numpy as np
 from polhode.fit._recording import Recording
 
 
+class MissingColumnsError(ValueError):
+    """Columns that a file does not have; ``roles``: what they are needed for."""
+
+    roles: tuple[str, ...] = ()
+
+
 class LoadedCsv(NamedTuple):
     """A recording, the names of its columns by role, and the units that these names state (role ->
     unit, only for columns with a unit).
@@ -95,7 +101,7 @@ def load_recording(
             times * time_scale, data[:, 1:4] * scale, wheel_speed=wheel, omega_noise=noise
         )
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise type(error)(f"{path}: {error}") from None
     return LoadedCsv(recording, header_names, units)
 
 
@@ -111,14 +117,15 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
     }
     if columns.get("wheel"):
         header_names["wheel"] = columns["wheel"]
-    missing_columns = [
-        f"{role} -> {name}" for role, name in header_names.items() if name not in names
-    ]
-    if missing_columns:
-        raise ValueError(
-            f"{path} does not have the requested columns, missing: {', '.join(missing_columns)};"
+    missing = {role: name for role, name in header_names.items() if name not in names}
+    if missing:
+        missing_columns = ", ".join(f"{role} -> {name}" for role, name in missing.items())
+        error = MissingColumnsError(
+            f"{path} does not have the requested columns, missing: {missing_columns};"
             f" its columns are: {', '.join(names) or 'none'}{_headless(names)}."
         )
+        error.roles = tuple(missing)
+        raise error
     shared = [name for name in header_names.values() if [*header_names.values()].count(name) > 1]
     if shared:
         roles = [role for role, name in header_names.items() if name == shared[0]]

@@ -22,6 +22,7 @@ class Finding(enum.IntFlag):
     OUTLIERS = 512
     CALIBRATION = 1024
     AT_BOUND = 2048
+    PRIOR_DISAGREES = 4096
 
 
 WARNINGS = {
@@ -54,6 +55,9 @@ WARNINGS = {
     " misalignment_std=...), or the model lacks something that they make up for",
     Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may fit a"
     " value beyond better",
+    Finding.PRIOR_DISAGREES: "a value is more than 3.5 standard deviations from its prior, of the"
+    " prior and the data together: state a wider prior_std, or the model lacks something that this"
+    " value makes up for",
 }
 SCENE_WARNINGS = WARNINGS | {
     Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
@@ -70,6 +74,15 @@ SCALE_UNKNOWN = (
 """Warning of every fit to torque-free rates."""
 UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 """Findings that raise an error unless ``throw=False``."""
+MODEL_FLAWS = (
+    UNUSABLE
+    | Finding.POOR
+    | Finding.OUTLIERS
+    | Finding.NOT_WHITE
+    | Finding.CALIBRATION
+    | Finding.PRIOR_DISAGREES
+)
+"""Findings by which the model does not explain the readings."""
 
 
 class Observability(NamedTuple):

@@ -17,11 +17,12 @@ from polhode._method import AbstractMethod
 from polhode._scene import Scene
 from polhode._scene._scene import places_of
 from polhode.fit._conclude import conclude, conclude_scene
-from polhode.fit._model import FreeMotion, LeafMotion, NoInertia, SteppedMotion
+from polhode.fit._model import FreeMotion, NoInertia, SteppedMotion, entries_of
 from polhode.fit._numerics import compiled
 from polhode.fit._options import FitOptions, Gyroscope, calibrate, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
 from polhode.fit._result import Fit, checked_fit
+from polhode.fit._scene_motions import LeafMotion
 from polhode.fit._solve import solve_fit
 
 # ``fit_inertia``: the inertia of bodies from recordings of their motion.
@@ -309,14 +310,12 @@ def fit_scene(
     check_usable(options, recordings[0])
     places = places_of(scene, free)
     starts = [jax.tree.leaves(scene)[i] for i in places]
-    motion = LeafMotion(
-        scene,
-        places,
-        _start(attitude, scene),
-        method,
-        rtol,
-        None if bounds is None else _bounds(bounds, starts),
-        None if prior_std is None else _widths(prior_std, starts),
+    motion = LeafMotion(scene, places, _start(attitude, scene), method, rtol)
+    counts = motion.entry_counts
+    motion = dataclasses.replace(
+        motion,
+        bounds=None if bounds is None else _entries(_bounds(bounds, starts), counts),
+        widths=None if prior_std is None else _entries(_widths(prior_std, starts), counts),
     )
     options = dataclasses.replace(options, motion=motion, unknown=NoInertia())
     if isinstance(data, Recording):
@@ -359,6 +358,20 @@ def _widths(prior_std: Sequence, starts: Sequence[Array]) -> tuple[Array | None,
         require_positive(f"prior_std[{k}]", std, hint="None stands for no prior")
         arrays.append(_like_start(f"prior_std[{k}]", std, start))
     return tuple(arrays)
+
+
+def _entries(arrays: tuple, counts: Sequence[int | None]) -> tuple:
+    """``arrays`` with the entries of symmetric tensors in place of their nine components."""
+
+    def entries(tensor, count):
+        is_symmetric = np.asarray(tensor == tensor.T)
+        require(is_symmetric, f"bounds and priors of a tensor must be symmetric, got {tensor}.")
+        return entries_of(tensor, count)
+
+    return tuple(
+        x if n is None else jax.tree.map(lambda tensor, n=n: entries(tensor, n), x)
+        for x, n in zip(arrays, counts, strict=True)
+    )
 
 
 def _like_start(name: str, value: ArrayLike, start: Array) -> Array:

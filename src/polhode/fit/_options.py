@@ -9,20 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, is_concrete, require
 from polhode.fit._model import AbstractInertiaUnknown, AbstractMotion, SteppedMotion
 from polhode.fit._numerics import inverse
-from polhode.fit._recording import Recording, central_slope, interpolate_gaps
+from polhode.fit._recording import Recording, central_slope, interpolate_gaps, saturation
 from polhode.inertia import Inertia
 
 # ``Gyroscope``: one sensor model for simulated readings and for fits.
 
 # Number of pieces of a recording in which the walk of the bias is linear.
 WALK_KNOTS = 16
-# Relative distance from ``max_rate`` within which a reading counts as saturated.
-_AT_LIMIT = 1e-9
 
 
 class Gyroscope(eqx.Module):
@@ -185,8 +184,9 @@ def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
         return recording
     omega, noise, dtype = recording.omega, recording.omega_noise, recording.omega.dtype
     limits = recording.saturated
-    if limits is None:
-        limits = saturation(recording, gyroscope.max_rate)
+    if limits is None or gyroscope.max_rate is not None:
+        of_readings = saturation(recording, gyroscope.max_rate)
+        limits = of_readings if limits is None else jnp.where(limits != 0, limits, of_readings)
     if gyroscope.bias is not None:
         omega = omega - jnp.broadcast_to(gyroscope.bias.astype(dtype), omega.shape)
     if gyroscope.noise_density:
@@ -234,44 +234,6 @@ def _limits_of_rates(limits: Array, present: Array, back: Array) -> tuple[Array,
     return jnp.where(has_own_bounds, of_rates, jnp.zeros_like(of_rates)), remaining
 
 
-def saturation(recording: Recording, max_rate: float | None = None) -> Float[Array, "*b t 3"]:
-    """1 for readings at an upper limit of their axis, -1 at a lower one, else 0.
-
-    With ``max_rate`` these are the readings of that magnitude. Without it an axis counts as
-    saturated if at least four samples and 1 % of all equal its extreme value, and five times as
-    many as equal the next value (coarse digitisation repeats both). An upper limit is positive and
-    a lower one negative; an axis that varies by less than four digitisation steps has no limit.
-    """
-    omega = recording.omega
-    if omega is None:
-        return jnp.zeros((*recording.times.shape, 3), recording.times.dtype)
-    present = recording.present[..., None] > 0
-    dtype = omega.dtype
-    if max_rate is not None:
-        beyond = (jnp.abs(omega) >= max_rate * (1 - _AT_LIMIT)) & present
-        return jnp.sign(omega) * beyond.astype(dtype)
-    samples = jnp.sum(present.astype(dtype), axis=-2)
-    size = jnp.max(jnp.where(present, jnp.abs(omega), 0), axis=(-2, -1))[..., None]
-
-    def at_upper_limit(values):
-        values = jnp.where(present, values, -jnp.inf)
-        greatest = jnp.max(values, axis=-2, keepdims=True)
-        equal = values == greatest
-        below = jnp.where(equal, -jnp.inf, values)
-        second_greatest = jnp.max(below, axis=-2, keepdims=True)
-        count = jnp.sum(equal.astype(dtype), axis=-2)
-        others = jnp.sum(((below == second_greatest) & jnp.isfinite(below)).astype(dtype), axis=-2)
-        is_enough = (count >= 4) & (count >= 0.01 * samples)
-        # a constant rate has no second value, or one that differs by rounding error only
-        top, second = greatest[..., 0, :], second_greatest[..., 0, :]
-        extent = top - jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
-        varies = jnp.isfinite(second) & (extent > 1e-6 * size) & (extent >= 4 * (top - second))
-        clipped = is_enough & (count >= 5 * others) & varies & (top > 0)
-        return (equal & present & clipped[..., None, :]).astype(dtype)
-
-    return at_upper_limit(omega) - at_upper_limit(-omega)
-
-
 class Huber(eqx.Module):
     """Robust loss: residuals beyond ``threshold`` standard deviations count linearly."""
 
@@ -287,6 +249,12 @@ class Huber(eqx.Module):
         large_size = jnp.where(inside, self.threshold, size)
         outside = jnp.sqrt(2 * self.threshold * large_size - self.threshold**2)
         return jnp.where(inside, residual, jnp.sign(residual) * outside)
+
+    @property
+    def inner_variance(self) -> Array:
+        """Variance of standard normal deviates within the threshold."""
+        k = jnp.asarray(self.threshold, float)
+        return 1 - 2 * k * norm.pdf(k) / (2 * norm.cdf(k) - 1)
 
     def inverse(self, reduced: Array) -> Array:
         """The residual that the loss maps to ``reduced``."""

@@ -22,8 +22,15 @@ from polhode._checks import (
 )
 from polhode.rotation import conjugate, multiply, normalise, wxyz_to_rotation_vector
 
+
+class RateUnitError(ValueError):
+    """Rates or times that are probably not in rad/s or s."""
+
+
 # rotation angle between samples [rad] above which a recording under-samples the motion
 _TURN_PER_SAMPLE = np.pi
+# relative distance from ``max_rate`` within which a reading counts as saturated
+_AT_LIMIT = 1e-9
 
 
 class Recording(eqx.Module):
@@ -198,6 +205,54 @@ def size_of_data(recording: Recording, channels: int) -> Array:
     return count - jnp.sum(jnp.abs(recording.saturated) * recording.present[..., None])
 
 
+def is_measured(recording: Recording, channels: int) -> Array:
+    """Whether each value (..., T, channels) is measured: neither a gap nor a saturated reading."""
+    present = recording.present[..., None] > 0
+    if recording.saturated is None:
+        return jnp.repeat(present, channels, axis=-1)
+    # the rates are the first three channels
+    others = jnp.repeat(present, channels - 3, axis=-1)
+    return jnp.concatenate([present & (recording.saturated == 0), others], axis=-1)
+
+
+def saturation(recording: Recording, max_rate: float | None = None) -> Float[Array, "*b t 3"]:
+    """1 for readings at an upper limit of their axis, -1 at a lower one, else 0.
+
+    With ``max_rate`` these are the readings of that magnitude. Without it an axis counts as
+    saturated if at least four samples and 1 % of all equal its extreme value, and five times as
+    many as equal the next value (coarse digitisation repeats both). An upper limit is positive and
+    a lower one negative; an axis that varies by less than four digitisation steps has no limit.
+    """
+    omega = recording.omega
+    if omega is None:
+        return jnp.zeros((*recording.times.shape, 3), recording.times.dtype)
+    present = recording.present[..., None] > 0
+    dtype = omega.dtype
+    if max_rate is not None:
+        beyond = (jnp.abs(omega) >= max_rate * (1 - _AT_LIMIT)) & present
+        return jnp.sign(omega) * beyond.astype(dtype)
+    samples = jnp.sum(present.astype(dtype), axis=-2)
+    size = jnp.max(jnp.where(present, jnp.abs(omega), 0), axis=(-2, -1))[..., None]
+
+    def at_upper_limit(values):
+        values = jnp.where(present, values, -jnp.inf)
+        greatest = jnp.max(values, axis=-2, keepdims=True)
+        equal = values == greatest
+        below = jnp.where(equal, -jnp.inf, values)
+        second_greatest = jnp.max(below, axis=-2, keepdims=True)
+        count = jnp.sum(equal.astype(dtype), axis=-2)
+        others = jnp.sum(((below == second_greatest) & jnp.isfinite(below)).astype(dtype), axis=-2)
+        is_enough = (count >= 4) & (count >= 0.01 * samples)
+        # a constant rate has no second value, or one that differs by rounding error only
+        top, second = greatest[..., 0, :], second_greatest[..., 0, :]
+        extent = top - jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
+        varies = jnp.isfinite(second) & (extent > 1e-6 * size) & (extent >= 4 * (top - second))
+        clipped = is_enough & (count >= 5 * others) & varies & (top > 0)
+        return (equal & present & clipped[..., None, :]).astype(dtype)
+
+    return at_upper_limit(omega) - at_upper_limit(-omega)
+
+
 @jax.jit
 def interpolate_gaps(
     times: Float[Array, "*b t"], present: Float[Array, "*b t"], values: Array
@@ -278,6 +333,11 @@ def stack(recordings: Sequence[Recording]) -> Recording:
             present=jnp.where(steps > 0, 0, longer.present),
         )
 
+    if any(r.saturated is not None for r in recordings):
+        recordings = [
+            dataclasses.replace(r, saturated=saturation(r)) if r.saturated is None else r
+            for r in recordings
+        ]
     kinds = {jax.tree.structure(r) for r in recordings}
     require(len(kinds) == 1, "the recordings must hold the same kinds of data, got a mixture.")
     return jax.tree.map(lambda *parts: jnp.stack(parts), *map(pad, recordings))
@@ -286,8 +346,9 @@ def stack(recordings: Sequence[Recording]) -> Recording:
 def averaged(recording: Recording, count: int) -> Recording:
     """Recording of means over blocks of ``count`` samples; a block with a gap is a gap.
 
-    For sampling much faster than the motion. Raises ValueError for fewer than four blocks, and for
-    recordings with attitudes.
+    For sampling much faster than the motion. The mean of a block with a saturated reading is a
+    bound of its mean rate, as the reading is (``Recording.saturated``). Raises ValueError for fewer
+    than four blocks, and for recordings with attitudes.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise ValueError(f"count must be an integer, at least 1, got {count!r}.")
@@ -306,9 +367,17 @@ def averaged(recording: Recording, count: int) -> Recording:
         return jnp.mean(blocks.reshape(shape), axis=place + 1)
 
     means, noise_of_mean = jax.tree.map(mean, recording), lambda noise: noise / count**0.5
+    limits, present = None, jnp.floor(means.present)
+    if recording.omega is not None:
+        limits = saturation(recording) if recording.saturated is None else recording.saturated
+        ends = (mean((side * limits > 0).astype(present.dtype)) > 0 for side in (1, -1))
+        upper, lower = (end.astype(present.dtype) for end in ends)
+        limits = upper - lower
+        present = present * (1 - jnp.max(upper * lower, axis=-1))  # a block at both limits: a gap
     return dataclasses.replace(
         means,
-        present=jnp.floor(means.present),
+        saturated=limits,
+        present=present,
         wheel_known=jax.tree.map(jnp.floor, means.wheel_known),
         omega_noise=jax.tree.map(noise_of_mean, means.omega_noise),
         force_noise=jax.tree.map(noise_of_mean, means.force_noise),
@@ -350,11 +419,12 @@ def _check_rates(omega, times):
             f"omega_body of sample {place + 1} would turn the body by {worst[place]:.3g} rad within"
             " one interval between samples, more than half a turn: an outlier? Set its row to NaN."
         )
-    require(
-        turn <= _TURN_PER_SAMPLE,
-        f"omega_body turns the body by up to {turn.max():.3g} rad between samples, more than half "
-        "a turn; are the rates in deg/s (multiply by pi/180) or the times in ms (divide by 1000)?",
-    )
+    if np.any(turn > _TURN_PER_SAMPLE):
+        raise RateUnitError(
+            f"omega_body turns the body by up to {turn.max():.3g} rad between samples, more than "
+            "half a turn; are the rates in deg/s (multiply by pi/180) or the times in ms (divide by"
+            " 1000)?"
+        )
 
 
 def _noise(name, value, shape, dtype):

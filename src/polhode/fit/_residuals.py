@@ -245,6 +245,21 @@ def prior_residuals(parameters: Parameters, recording: Recording, model: Model) 
     return [(jnp.sqrt(precision) * value).ravel() for precision, value in parts]
 
 
+def square_sum(residuals: Array, total: Array, robust: Huber | None) -> Float[Array, ""]:
+    """Sum of squares of the residuals (r, t, c) of ``total`` values.
+
+    With a robust loss, of which ``residuals`` are the result, that of normal noise as large as the
+    residuals within the threshold are.
+    """
+    if robust is None:
+        return jnp.sum(residuals**2)
+    residuals = robust.inverse(residuals)
+    is_inner = jnp.abs(residuals) <= robust.threshold
+    inner_count = total - jnp.sum((~is_inner).astype(total.dtype))
+    mean_square = jnp.sum(jnp.where(is_inner, residuals**2, 0)) / jnp.maximum(inner_count, 1)
+    return total * mean_square / robust.inner_variance.astype(total.dtype)
+
+
 def prior_cost(parameters: Parameters, recording: Recording, model: Model) -> Float[Array, ""]:
     """Half the sum of squares of ``prior_residuals``."""
     total = jnp.zeros((), recording.times.dtype)
@@ -295,7 +310,8 @@ class Linear(NamedTuple):
     ``shared``, ``own``, ``factored_residuals``: column blocks of the triangular factor R of a
     recording's matrix ``[derivatives by shared unknowns, by own unknowns, residuals] = Q R``. Its
     sums of squares and products are those of all samples, so that an optimiser works on a few rows.
-    ``at``: the shared unknowns at that point.
+    ``at``: the shared unknowns at that point. ``products``: for a robust loss, sums of products of
+    the derivatives before the loss (unknowns in the order shared, own), by channel; else None.
     """
 
     residuals: Float[Array, "r t c"]
@@ -303,6 +319,7 @@ class Linear(NamedTuple):
     own: Float[Array, "r q o"]
     factored_residuals: Float[Array, "r q"]
     at: Float[Array, " s"]
+    products: Float[Array, "r c u u"] | None = None
 
     def residuals_near(
         self, shared: Float[Array, " s"], own: Float[Array, "r o"]
@@ -314,13 +331,29 @@ class Linear(NamedTuple):
             + jnp.einsum("rqo,ro->rq", self.own, own)
         )
 
-    def information(self) -> Float[Array, "p p"]:
-        """``J^T J`` in the order shared, then own unknowns recording by recording."""
-        recordings, size = self.own.shape[0], self.own.shape[-1]
-        corner = jnp.einsum("rqs,rqz->sz", self.shared, self.shared)
-        side = jnp.einsum("rqs,rqo->sro", self.shared, self.own)
+    def scaled(self, sizes: Float[Array, " s"]) -> "Linear":
+        """The same residuals by shared unknowns divided by ``sizes``."""
+        products = self.products
+        if products is not None:
+            scale = jnp.concatenate([sizes, jnp.ones(self.own.shape[-1], sizes.dtype)])
+            products = products * (scale[:, None] * scale[None])[None, None]
+        return self._replace(shared=self.shared * sizes[None, None], products=products)
+
+    def information(self, weights: Float[Array, "r c"] | None = None) -> Float[Array, "p p"]:
+        """``J^T J`` in the order shared, then own unknowns recording by recording.
+
+        ``weights``: of the channels of each recording in ``products``; None: without a robust loss.
+        """
+        (recordings, _, size), count = self.own.shape, self.shared.shape[-1]
+        if weights is None:
+            rows = jnp.concatenate([self.shared, self.own], axis=-1)
+            products = jnp.einsum("rqu,rqv->ruv", rows, rows)
+        else:
+            products = jnp.einsum("rc,rcuv->ruv", weights, self.products)
+        corner = jnp.sum(products[:, :count, :count], axis=0)
+        side = jnp.moveaxis(products[:, :count, count:], 0, 1)
         side = side.reshape(corner.shape[0], recordings * size)
-        blocks = jnp.einsum("rqo,rqz->roz", self.own, self.own)
+        blocks = products[:, count:, count:]
         own_blocks = (
             jnp.eye(recordings, dtype=corner.dtype)[:, None, :, None] * blocks[:, :, None, :]
         )
@@ -409,7 +442,7 @@ def linearise(
     def at(own, single, attitude):
         one_recording = jax.tree.map(lambda leaf: leaf[None], single)
         start = None if attitude is None else attitude[None]
-        one_model = dataclasses.replace(model, attitude=start)
+        one_model = dataclasses.replace(model, attitude=start, robust=None)
 
         def flat(motion, parameters):
             parts = residuals_of_motion(motion, parameters, one_recording, one_model)
@@ -444,8 +477,15 @@ def linearise(
         return by_shared, by_own, rows
 
     by_shared, by_own, rows = kernel(jax.vmap(at))(own, recording, model.attitude)
+    products = None
+    if model.robust is not None:
+        derivatives = jnp.concatenate([by_shared, by_own], axis=-1)
+        products = jnp.einsum("rtcu,rtcv->rcuv", derivatives, derivatives)
+        rows, slope = jax.jvp(model.robust, (rows,), (jnp.ones_like(rows),))
+        by_shared, by_own = slope[..., None] * by_shared, slope[..., None] * by_own
     columns = jnp.concatenate([by_shared, by_own, rows[..., None]], axis=-1)
     columns = columns.reshape(rows.shape[0], -1, columns.shape[-1])
     factor = triangle(columns)
     count = shared.shape[0]
-    return Linear(rows, factor[..., :count], factor[..., count:-1], factor[..., -1], shared)
+    parts = factor[..., :count], factor[..., count:-1], factor[..., -1]
+    return Linear(rows, *parts, shared, products)

@@ -16,7 +16,9 @@ from jaxtyping import Array, Float, Int
 from polhode._atomic import atomic_write
 from polhode._checks import ArrayLike, require
 from polhode._scene import Scene, State
+from polhode.fit._determination import NullSpace
 from polhode.fit._findings import (
+    MODEL_FLAWS,
     SCALE_UNKNOWN,
     SCENE_WARNINGS,
     UNUSABLE,
@@ -27,12 +29,10 @@ from polhode.fit._findings import (
     shown_beside_prior,
     shown_of_gain,
 )
-from polhode.fit._model import LeafMotion, Parameters, entries_of, whole_of
+from polhode.fit._model import Parameters, entries_of, whole_of
 from polhode.fit._residuals import Model
+from polhode.fit._scene_motions import LeafMotion
 from polhode.inertia import Inertia
-
-# Component of an unknown along null directions above which it counts as undetermined.
-MAX_NULL_PART = 1e-3
 
 
 class InertiaEstimate(eqx.Module):
@@ -65,12 +65,13 @@ class Fit(eqx.Module):
       attitudes its attitude is the identity, or the ``attitude`` of ``fit_scene``.
     - ``covariance`` (..., p, p) of all unknowns: the tensor's entries xx, yy, zz, yz, zx, xy (three
       for ``MomentsOnly``, none of a scene), bias, mounting, lever, the motion's unknowns or the
-      scene's values, gain (row by row) and delay, then of each recording rates and attitude
-      (rotation vector) at its start and the walk of the bias. It is the pseudo-inverse of
-      ``information`` (..., p, p), which includes the calibration, times ``noise**2`` where the
-      level of the noise was estimated.
+      scene's values (of a tensor its six entries), gain (row by row) and delay, then of each
+      recording rates and attitude (rotation vector) at its start and the walk of the bias. It is
+      the pseudo-inverse of ``information`` (..., p, p), which includes the calibration, times
+      ``noise**2`` where the level of the noise was estimated.
     - ``null_count`` (...): number of directions of the unknowns that the data do not show.
-    - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
+    - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi); with
+      a robust loss, of those within its threshold.
     - ``whiteness`` (...): probability of autocorrelations as large as observed, for independent
       residuals (Ljung-Box).
     - ``rms`` (...): root mean square of the residual rates [rad/s]; NaN without rates.
@@ -103,6 +104,7 @@ class Fit(eqx.Module):
     residuals: dict[str, Array]
     parameters: Parameters
     model: Model
+    _null: NullSpace
     _inertia: InertiaEstimate | None = None
 
     def _of_inertia(self, name: str) -> InertiaEstimate:
@@ -211,22 +213,20 @@ class Fit(eqx.Module):
         """
         lead = np.ndim(self.diagnostics)
         values = [jnp.reshape(x, (-1, *jnp.shape(x)[lead:]))[body] for x in self.values]
-        count = self.model.entries
-        if self._inertia is not None:
-            # the unknowns are entries of the tensor, not its nine components
-            values = [entries_of(values[0], count), *values[1:]]
+        counts = self._entry_counts
+        # the unknowns are entries of a symmetric tensor, not its nine components
+        unknowns = [x if n is None else entries_of(x, n) for x, n in zip(values, counts)]
 
         def of_unknowns(parts):
-            if self._inertia is not None:
-                parts = [whole_of(parts[0], count), *parts[1:]]
-            return jnp.asarray(function(parts))
+            return jnp.asarray(
+                function([x if n is None else whole_of(x, n) for x, n in zip(parts, counts)])
+            )
 
-        value, slopes = of_unknowns(values), jax.jacfwd(of_unknowns)(values)
+        value, slopes = of_unknowns(unknowns), jax.jacfwd(of_unknowns)(unknowns)
         slopes = [np.reshape(np.asarray(x), (value.size, -1)) for x in slopes]
         skipped = self._count("bias", "mounting", "lever")
-        covariance, information = (
-            np.asarray(x).reshape(-1, *np.shape(x)[-2:])[body]
-            for x in (self.covariance, self.information)
+        covariance, null = jax.tree.map(
+            lambda x: np.reshape(x, (-1, *np.shape(x)[lead:]))[body], (self.covariance, self._null)
         )
         # in the order of the covariance: entries, sensors, then the motion's values
         full_derivative = np.zeros((value.size, covariance.shape[0]))
@@ -238,14 +238,15 @@ class Fit(eqx.Module):
         std = np.sqrt(
             np.maximum(np.einsum("ij,jk,ik->i", full_derivative, covariance, full_derivative), 0)
         )
-        size = np.sqrt(np.diagonal(information))
-        safe = np.where(size > 0, size, 1)
-        eigenvalues, axes = np.linalg.eigh(information / safe[:, None] / safe)
-        null = axes[:, eigenvalues <= 1e3 * np.finfo(information.dtype).eps * eigenvalues[-1]]
-        leaning = np.linalg.norm(full_derivative @ (null / safe[:, None]), axis=1)
-        reach = np.linalg.norm(full_derivative / safe, axis=1)
-        std = np.where(leaning > MAX_NULL_PART * reach, np.inf, std)
+        std = np.where(null.undetermines(full_derivative), np.inf, std)
         return np.asarray(value), std.reshape(value.shape)
+
+    @property
+    def _entry_counts(self) -> list[int | None]:
+        """Number of unknown entries of each symmetric tensor of ``values``, None for the others."""
+        if self._inertia is not None:
+            return [self.model.entries, *[None] * (len(self.values) - 1)]
+        return self.model.motion.entry_counts
 
     @property
     def value_names(self) -> list[str]:
@@ -290,15 +291,9 @@ class Fit(eqx.Module):
 
     def limit(self, body: int = 0) -> str:
         """What limits the result of one body, in one sentence."""
-        flags = set(self._flags(body))
-        model = flags & {Finding.NOT_FINITE, Finding.STEP_LIMIT, Finding.AXES_DISAGREE}
-        model |= flags & {Finding.POOR, Finding.OUTLIERS, Finding.NOT_WHITE, Finding.CALIBRATION}
-        if model:
-            words = ", ".join(
-                str(flag.name).lower().replace("_", " ")
-                for flag in self._flags(body)
-                if flag in model
-            )
+        flaws = [flag for flag in self._flags(body) if flag & MODEL_FLAWS]
+        if flaws:
+            words = ", ".join(str(flag.name).lower().replace("_", " ") for flag in flaws)
             return f"the model, which does not explain the readings ({words})"
         if self._inertia is not None:
             std = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
@@ -481,8 +476,9 @@ class Fit(eqx.Module):
                 remedy = "attitudes (wxyz), a wheel, or knowledge of the body"
                 rows.append(Observability("handedness of the axes", 1, 0, "nothing", remedy))
         else:
-            for k, spread in enumerate(self.std):
+            for k, (spread, entries) in enumerate(zip(self.std, self._entry_counts)):
                 flat = np.asarray(spread).reshape(max(np.size(self.diagnostics), 1), -1)[body]
+                flat = flat if entries is None else np.asarray(entries_of(flat.reshape(3, 3)))
                 has_prior = self._prior_std[k] is not None
                 shown_count = int(np.isfinite(flat).sum())
                 if has_prior:
@@ -508,7 +504,7 @@ class Fit(eqx.Module):
     def _count_shown_beside_prior(self, k: int, body: int) -> int:
         """``shown_beside_prior`` of a value of one body."""
         lead = np.ndim(self.diagnostics)
-        sizes = [int(np.prod(np.shape(x)[lead:])) for x in self.values]
+        sizes = [int(np.prod(np.shape(x)[lead:])) for x in self.parameters.motion]
         first = self._count("bias", "mounting", "lever") + sum(sizes[:k])
         place = slice(first, first + sizes[k])
         covariance = np.asarray(self.covariance)

@@ -33,7 +33,15 @@ from polhode.fit._recording import (
     turns_between_samples,
     turns_of_rates,
 )
-from polhode.fit._residuals import Linear, Model, linearise, prior_cost, prior_residuals, unknowns
+from polhode.fit._residuals import (
+    Linear,
+    Model,
+    linearise,
+    prior_cost,
+    prior_residuals,
+    square_sum,
+    unknowns,
+)
 from polhode.fit._start import (
     alternative_starts,
     nearest_physical,
@@ -163,7 +171,9 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         With a known noise it is one, else that of the present residuals: the sum of squares is then
         proportional, to first order in 1/T, to the log-likelihood with an unknown noise.
         """
-        unit = jnp.ones((), dtype) if trusted else jnp.sqrt(jnp.sum(linear.residuals**2) / count)
+        unit = jnp.ones((), dtype)
+        if not trusted:
+            unit = jnp.sqrt(square_sum(linear.residuals, count, options.robust) / count)
         typical = 10 / weight / jnp.sqrt(count / rates.shape[0])
         return jnp.maximum(unit, _LEAST_NOISE * typical)
 

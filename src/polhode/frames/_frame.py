@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from polhode._checks import ArrayLike, as_float_array, batch_of, is_concrete, require, vectors_like
 from polhode._parts import Signature, as_static, takes
 from polhode._trajectory import Trajectory
-from polhode.frames._sampled_attitude import SampledAttitude, motion_of_axes
+from polhode.frames._sampled_attitude import SampledAttitude, motion_of_axes, rates_of_axes
 from polhode.rotation import (
     conjugate,
     identity,
@@ -466,7 +466,10 @@ def _times(mass: ArrayLike, vector: Array) -> Array:
 
 @eqx.filter_jit
 def angular_acceleration(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
-    """Derivative (..., T, 3) of the body rates [rad/s^2] by the equations of motion."""
+    """Derivative (..., T, 3) of the body rates [rad/s^2] by the equations of motion.
+
+    The body rates are ``Trajectory.omega_body``, without the slip of a ``ph.EnergySink``.
+    """
     scene, t = trajectory._scene, trajectory._t
     omega = trajectory.omega_body
     wxyz = None if trajectory.scene.is_free else trajectory.wxyz
@@ -474,9 +477,13 @@ def angular_acceleration(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
 
 
 def gyroscope(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
-    """Reading (..., T, 3) of a gyroscope along the body axes [rad/s]: the body rates, wherever it
-    is mounted."""
-    return trajectory.omega_body
+    """Reading (..., T, 3) of a gyroscope along the body axes [rad/s], wherever it is mounted.
+
+    These are the body rates, and with a ``ph.EnergySink`` the slip as well.
+    """
+    if trajectory.scene.torque is None:
+        return trajectory.omega_body
+    return rates_of_axes(trajectory)
 
 
 def accelerometer(
@@ -491,12 +498,13 @@ def accelerometer(
     the lever arm r from the point about which the body rotates. ``gravity_space`` (3,) [m/s^2] is
     for a body that rotates about a point fixed in space; leave it None for a body in free fall,
     where gravity and the acceleration of the mass centre cancel. Leading axes of positions
-    broadcast against the bodies: (n, 3) are n positions on one body.
+    broadcast against the bodies: (n, 3) are n positions on one body. The rates are those of
+    ``gyroscope``.
 
     Raises ValueError if the trajectory has no rates (or no attitude where it is needed), or for
     positions whose leading axes do not broadcast against the bodies.
     """
-    omega = trajectory.omega_body
+    omega, acceleration = motion_of_axes(trajectory)
     lever = as_float_array("position_body", position_body, (3,)).astype(omega.dtype)
     batch = batch_of(position_body=(lever, 1), omega_body=(omega, 2))
 
@@ -504,7 +512,7 @@ def accelerometer(
         return jnp.broadcast_to(samples, (*batch, *omega.shape[-2:]))
 
     lever, omega_of_batch = of_batch(lever[..., None, :]), of_batch(omega)
-    acceleration = of_batch(angular_acceleration(trajectory))
+    acceleration = of_batch(acceleration)
     reading = jnp.cross(omega_of_batch, jnp.cross(omega_of_batch, lever))
     reading = reading + jnp.cross(acceleration, lever)
     if gravity_space is None:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from polhode._checks import ArrayLike, as_float_array
 from polhode._hamiltonian import components
 from polhode._kernels import smooth
+from polhode._scene import Scene
 from polhode._trajectory import Trajectory
 from polhode.rotation import (
     conjugate,
@@ -18,30 +19,37 @@ from polhode.rotation import (
 from polhode.rotation._quaternion import wxyz_rate
 
 
+def _axes_rate(scene: Scene, omega: Array, t: Array, spins: tuple[Array, ...]) -> Array:
+    """Angular velocity (..., 3) [rad/s] of the body axes: the body rate, and with an energy sink
+    the slip."""
+    if scene.torque is None:
+        return omega
+    momentum = scene.with_spins(spins).momentum(omega, t)
+    slip = scene.torque.slip(t, components(momentum), components(omega))
+    if slip is None:
+        return omega
+    return omega + jnp.stack(jnp.broadcast_arrays(*slip), axis=-1)
+
+
+@eqx.filter_jit
+def rates_of_axes(trajectory: Trajectory) -> Array:
+    """Angular velocities (..., T, 3) [rad/s] of the body axes, slip of an energy sink included."""
+    scene = trajectory._scene
+    spins = scene.dynamics.wheels.spins if scene.dynamics.coupled else ()
+    return _axes_rate(scene, trajectory.omega_body, trajectory._t, spins)
+
+
 @eqx.filter_jit
 def motion_of_axes(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Angular velocity (T, 3) [rad/s] of the axes of one body, and its derivative by time.
-
-    It is the body rate, plus the slip of the axes of a body with an energy sink.
-    """
+    """``rates_of_axes``, and their derivatives by time (..., T, 3) [rad/s^2]."""
     scene, omega, t = trajectory._scene, trajectory.omega_body, trajectory._t
     wxyz = None if trajectory.scene.is_free else trajectory.wxyz
     acceleration, spin_rates = scene.changes(wxyz, omega, t)
-    torque = scene.torque
-    if torque is None:
+    if scene.torque is None:
         return omega, acceleration
     spins = scene.dynamics.wheels.spins if spin_rates else ()
-
-    def slip(omega, t, spins):
-        momentum = scene.with_spins(spins).momentum(omega, t)
-        parts = torque.slip(t, components(momentum), components(omega))
-        return None if parts is None else jnp.stack(parts, axis=-1)
-
-    if slip(omega, t, spins) is None:
-        return omega, acceleration
     tangents = acceleration, jnp.ones_like(t), spin_rates
-    value, change = jax.jvp(slip, (omega, t, spins), tangents)
-    return omega + value, acceleration + change
+    return jax.jvp(lambda *at: _axes_rate(scene, *at), (omega, t, spins), tangents)
 
 
 @jax.jit

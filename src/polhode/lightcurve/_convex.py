@@ -19,7 +19,7 @@ from polhode.lightcurve._brightness import (
     harmonics,
     moments_of,
 )
-from polhode.lightcurve._least_squares import stepped
+from polhode.lightcurve._least_squares import damped_steps, next_damping, stepped
 from polhode.lightcurve._nulls import Linear
 from polhode.lightcurve._solutions import (
     Described,
@@ -31,6 +31,7 @@ from polhode.lightcurve._solutions import (
     ellipsoid_of,
     frequencies,
     momentum,
+    pole_std_of,
     same_periods,
 )
 
@@ -173,10 +174,8 @@ def refine(
 
     for _ in range(_STEPS):
         _, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
-        size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-        damped = matrix / size / size[:, None] + damping * np.eye(len(matrix))
-        step = -np.linalg.solve(damped, right / size) / size
-        step *= min(1.0, 0.5 / max(np.abs(np.r_[step[:2], step[5:]]).max(), 1e-30))
+        limited = np.delete(np.arange(len(matrix)), (2, 3, 4))  # all but the rates
+        (step,) = damped_steps(matrix[None], right[None], damping, limited)
         change = np.zeros((1, body.unknowns.shape[1] + 3))
         change[0, _MOTION], change[0, -3:] = step[:5], step[5:8]
         # ``stepped`` corrects the rates by derivatives of the periods, which do not exist at a
@@ -198,7 +197,7 @@ def refine(
         if better:
             body, coefficients = trial, coefficients + step[8:]
             (rest, slopes, open_area, by_open), chi2, cost = new, new_chi2, new_cost
-        damping = float(np.clip(damping * (0.2 if better else 5.0), 1e-9, 1e9))
+        damping = float(next_damping(damping, better))
         if quiet == 3:
             break
     data, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
@@ -320,7 +319,7 @@ def _solution(
         pole=np.degrees(
             [np.arctan2(pole[1], pole[0]) % (2 * np.pi), np.arcsin(np.clip(pole[2], -1, 1))]
         ),
-        pole_std=float(np.degrees(np.linalg.norm(std[5:]))),
+        pole_std=pole_std_of(std[5:]),
         wxyz=wxyz,
         omega_body=unknowns[4:7],
         offsets=linear.offsets(body.values, old),

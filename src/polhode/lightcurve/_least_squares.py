@@ -19,6 +19,7 @@ BATCH = 32
 # Priors of a body: logarithms of the axes' ratios 0 +- 0.8; those of the homogeneous ellipsoid of
 # its inertia within 0.25 of those of its shape; coefficients of the phase function +- 0.3.
 _SHAPE_SIGMA, _TIE_SIGMA, _PHASE_SIGMA = 0.8, 0.25, 0.3
+_JITTER = 1e-12  # added to the damping
 _EXPECTED = 40  # expectation-maximisation steps of ``spread_of_offsets``; 20 give three digits
 
 
@@ -145,7 +146,7 @@ class Problem:
         x = np.concatenate([bodies.unknowns, np.zeros((len(offsets), 3)), offsets], axis=1)
         rest = x @ rows.T - targets
         # Padding offsets, which no point has, are fixed at zero by a stiffness of 1; free offsets
-        # have stiffness 0, and only the jitter of `_solve_damped` keeps their equations regular.
+        # have stiffness 0, and only the damping and `_JITTER` keep their equations regular.
         soft = np.zeros(x.shape[1])
         soft[many + 3 :] = self.stiffness
         cost = (rest**2 * precision).sum(1) + (x**2 * soft).sum(1)
@@ -171,18 +172,17 @@ class Problem:
             # the same.
             active = np.pad(active, (0, -active.size % BATCH), mode="edge")
             old = select(state, active)
-            step = -_solve_damped(old.matrix, old.right, damping[active])
-            many = step.shape[1] - self.columns
-            # limits steps to half a unit in the logarithms and half a radian in attitude
-            size = np.abs(np.delete(step[:, :many], (4, 5, 6), axis=1)).max(1)
-            step *= np.minimum(1, 0.5 / np.maximum(size, 1e-30))[:, None]
+            many = old.matrix.shape[1] - self.columns
+            # all but the rates: half a unit in the logarithms and half a radian in attitude
+            limited = np.delete(np.arange(many), (4, 5, 6))
+            step = damped_steps(old.matrix, old.right, damping[active] + _JITTER, limited)
             bodies = stepped(old.bodies, step[:, :many])
             new = self.evaluate(bodies, old.offsets + step[:, many:], limit[active])
             better = new.cost < old.cost
             gain = np.where(better, old.cost - new.cost, 0)
             for old_array, new_array in zip(jax.tree.leaves(state), jax.tree.leaves(new)):
                 old_array[active[better]] = new_array[better]
-            damping[active] = np.clip(damping[active] * np.where(better, 0.2, 5.0), 1e-9, 1e9)
+            damping[active] = next_damping(damping[active], better)
             # A rejected step counts as idle only at high damping: at low damping the next, shorter
             # step may still reduce the cost.
             small = np.where(
@@ -213,16 +213,27 @@ def spread_of_offsets(matrix, right, offsets, stiffness, groups: slice) -> float
     return float(np.sqrt(variance))
 
 
-def _solve_damped(matrix, right, damping):
-    """Solutions of symmetric systems, scaled to unit diagonal, to which ``damping`` is added."""
+def damped_steps(matrix, right, damping, limited) -> np.ndarray:
+    """Levenberg-Marquardt steps (b, u) of the normal equations ``matrix`` (b, u, u), ``right``.
+
+    ``damping`` (b,) is added to the diagonal, which is scaled to one. Steps are shortened so that
+    the unknowns ``limited`` (an index) change by at most 0.5.
+    """
     diagonal = np.einsum("bii->bi", matrix)
     size = np.sqrt(np.where(diagonal > 0, diagonal, 1))
     damped = matrix / size[:, :, None] / size[:, None]
     damped = np.nan_to_num(damped, posinf=0, neginf=0)
     eye = np.eye(matrix.shape[1])
-    damped = damped + eye * (np.reshape(damping, (-1, 1, 1)) + 1e-12 + (diagonal <= 0)[:, :, None])
+    damped = damped + eye * (np.reshape(damping, (-1, 1, 1)) + (diagonal <= 0)[:, :, None])
     right = np.nan_to_num(right / size, posinf=0, neginf=0)
-    return np.linalg.solve(damped, right[..., None])[..., 0] / size
+    step = -np.linalg.solve(damped, right[..., None])[..., 0] / size
+    longest = np.abs(step[:, limited]).max(1)
+    return step * np.minimum(1, 0.5 / np.maximum(longest, 1e-30))[:, None]
+
+
+def next_damping(damping, better) -> np.ndarray:
+    """The damping (b,) after steps that reduced the cost (``better``) or did not."""
+    return np.clip(damping * np.where(better, 0.2, 5.0), 1e-9, 1e9)
 
 
 def select(tree, index):

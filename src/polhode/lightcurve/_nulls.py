@@ -18,6 +18,7 @@ import numpy as np
 from polhode.lightcurve._brightness import seeliger_ellipsoid
 from polhode.lightcurve._data import BLOCK, LightCurve
 from polhode.lightcurve._frequencies import LINES, Pairs, Scan, _maxima, terms
+from polhode.lightcurve._least_squares import damped_steps, next_damping
 
 _CLIP = 4.0  # residuals are clipped at this multiple of the best model's scale
 _CANDIDATES = 10  # peaks of the spectrum of one period that are refined
@@ -376,12 +377,7 @@ def _improve_rotators(x, arrays, basis, steps: int = 25):
         prior_precision = np.diag([0.8**-2, 0.8**-2, 0, 0, 0, 0])
         matrix = np.einsum("bni,bnj->bij", slopes, slopes) + prior_precision
         right = np.einsum("bni,bn->bi", slopes, value) + x @ prior_precision
-        size = np.sqrt(np.maximum(np.einsum("bii->bi", matrix), 1e-12))
-        damped = matrix / size[:, :, None] / size[:, None]
-        damped = np.nan_to_num(damped) + damping[:, None, None] * np.eye(6)
-        step = np.linalg.solve(damped, np.nan_to_num(right / size)[..., None])[..., 0] / size
-        step *= np.minimum(1, 0.5 / np.maximum(np.abs(step[:, :5]).max(1), 1e-30))[:, None]
-        trial = x - step
+        trial = x + damped_steps(matrix, right, damping, np.arange(5))
         new, new_slopes = map(np.asarray, _rotators(trial, arrays, basis))
         axis_precision = prior_precision[0, 0]
 
@@ -394,7 +390,7 @@ def _improve_rotators(x, arrays, basis, steps: int = 25):
         x = np.where(better[:, None], trial, x)
         value = np.where(better[:, None], new, value)
         slopes = np.where(better[:, None, None], new_slopes, slopes)
-        damping = np.clip(damping * np.where(better, 0.2, 5.0), 1e-9, 1e9)
+        damping = next_damping(damping, better)
     return x, value
 
 

@@ -63,7 +63,7 @@ class Solution(NamedTuple):
     moments_std: np.ndarray  # (3,)
     axes: np.ndarray  # (3,) semi-axes over the longest
     pole: np.ndarray  # (2,) longitude and latitude of the angular momentum [deg]
-    pole_std: float  # [deg]
+    pole_std: float  # [deg], at most 98.2: that of a pole of which nothing is known
     wxyz: np.ndarray  # (4,) at t = 0, the first time
     omega_body: np.ndarray  # (3,) [rad / time unit]
     coefficients: np.ndarray  # of the phase function
@@ -290,7 +290,7 @@ def describe_solutions(
                         np.arcsin(np.clip(pole[k, 2], -1, 1)),
                     ]
                 ),
-                float(np.degrees(np.linalg.norm(std[5:]))),
+                pole_std_of(std[5:]),
                 wxyz[k],
                 unknowns[k, 4:7],
                 unknowns[k, 7:],
@@ -303,6 +303,14 @@ def describe_solutions(
             )
         )
     return Described(tuple(out), scale, alike, linearised)
+
+
+def pole_std_of(std: np.ndarray) -> float:
+    """Standard deviation of a pole [deg] from those of its unit vector (3,), by linear theory.
+
+    At most the root mean square of the angle to a random direction, ``sqrt(pi^2 / 2 - 2)`` rad.
+    """
+    return float(np.degrees(min(np.linalg.norm(std), np.sqrt(np.pi**2 / 2 - 2))))
 
 
 def covariance_of_periods(covariance: np.ndarray, f_phi: float, f_psi: float) -> np.ndarray:

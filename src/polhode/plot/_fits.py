@@ -130,13 +130,18 @@ def _single(result, recording, body) -> dict[str, Any]:
     }
 
 
+# Places of the entries of a symmetric tensor, in the order of ``Fit.covariance``.
+_ENTRIES = ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))
+
+
 def _of_scene(result, body: int) -> dict[str, Any]:
     """Names, values, standard deviations and correlations of the fitted numbers of a scene."""
     names, values, spreads = [], [], []
     lead = np.ndim(result.diagnostics)
-    for name, value, std in zip(result.value_names, result.values, result.std, strict=True):
+    parts = result.value_names, result.values, result.std, result._entry_counts
+    for name, value, std, entries in zip(*parts, strict=True):
         value, std = (np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body] for x in (value, std))
-        for place in np.ndindex(value.shape):
+        for place in np.ndindex(value.shape) if entries is None else _ENTRIES[:entries]:
             names.append(name + "".join(f"[{k}]" for k in place))
             values.append(value[place])
             spreads.append(std[place])
