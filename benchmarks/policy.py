@@ -46,6 +46,11 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "KERNEL_BATCH": ((4, 64), ("tops under vmap", "free bodies under vmap", "Jacobian of a top")),
     "KERNEL_SUM": ((64,), ("gradient of heavy tops", "gradient of Lagrange's tops")),
     "KERNEL_TABLE": ((0,), ("heavy top", "heavy tops", "Lagrange's tops")),
+    "KERNEL_PRODUCT": (
+        (0, 128),
+        ("matrix law", "gradient of a matrix law", "gradient of networks"),
+    ),
+    "KERNEL_INDEX": ((0, 4096), ("torque in a table", "gradient of a torque in a table")),
     "STAGE_WORK": ((2, 10**6), ("satellites", "gradient of heavy tops", "gradient of satellites")),
     "SUM_ROWS": ((1, 16), ("gradient of Lagrange's tops",)),
     "LANES": ((16, 32, 128, 256), ("heavy tops", "satellites")),
@@ -108,6 +113,14 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
     def network(t, wxyz, omega):
         hidden = jnp.maximum(weights[0] @ jnp.concatenate([wxyz, omega]), 0)
         return 0.1 * weights[1] @ hidden
+
+    gain = jnp.asarray(0.2 * np.eye(3) + 0.05)
+
+    def matrix_law(t, wxyz, omega):
+        return -gain @ jnp.clip(omega, -0.5, 0.5)
+
+    knots = np.linspace(0.0, 20.0, 100)
+    table = ph.Table(knots, 0.1 * np.stack([np.sin(knots), np.cos(knots), knots / 20], axis=1), 1)
 
     def triaxial(potential=None, torque=None):
         return lambda m: ph.Scene(ph.Inertia.from_moments(m), potential, torque)
@@ -216,6 +229,8 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         return lambda: ph.fit_inertia(times, readings)
 
     satellite = triaxial(gradient, drag)
+    controlled = triaxial(None, ph.FeedbackTorque(matrix_law))
+    tabulated = triaxial(None, ph.BodyTorque(table) + drag)
     return {
         "free body": value(triaxial(), 1),
         "free bodies": value(triaxial(), BODIES),
@@ -235,6 +250,10 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "tops under vmap": mapped(triaxial(gravity), 64),
         "free bodies under vmap": mapped(triaxial(), 64),
         "Jacobian of a top": jacobian(triaxial(gravity)),
+        "matrix law": value(controlled, 1),
+        "gradient of a matrix law": slope(controlled, 1),
+        "torque in a table": value(tabulated, 1),
+        "gradient of a torque in a table": slope(tabulated, 1),
         "network": value(triaxial(None, ph.FeedbackTorque(network)), 10),
         "gradient of networks": slope(triaxial(None, ph.FeedbackTorque(network)), 64),
         "gradient of free bodies": slope(triaxial(), BODIES),

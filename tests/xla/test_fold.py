@@ -5,12 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Literal, jaxpr_as_fun
 from solvers.heavy_top import heavy_top
 
 import polhode as ph
 from polhode._hamiltonian import Dynamics, lie_poisson_field
 from polhode._integrate._field import BoundTerm
-from polhode._kernels import specialise
+from polhode._kernels import is_fusible, specialise, without_repeats
+from polhode._kernels._programs import nested_jaxprs
 from polhode._scene import AlongZ
 
 N = 5
@@ -187,3 +189,79 @@ def test_fields_are_folded_to_the_same_numbers(fn):
     plain = lie_poisson_field(jnp.array(0.0), y, system)
     for a, b in zip(jax.tree.leaves(folded), jax.tree.leaves(plain)):
         np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)
+
+
+LAWS = {
+    "matrix times vector": lambda x, t: jnp.arange(9.0).reshape(3, 3) @ jnp.sin(x),
+    "vector times matrix": lambda x, t: jnp.cos(x) @ (t * jnp.arange(9.0).reshape(3, 3)),
+    "batch of products": lambda x, t: jnp.einsum(
+        "kij,kj->ki", t * jnp.arange(18.0).reshape(2, 3, 3), jnp.stack([x, x * x])
+    ).sum(axis=0),
+    "one entry set": lambda x, t: jnp.zeros(3).at[1].set(t * x[0]),
+    "entries set": lambda x, t: (x * x).at[jnp.array([2, 0])].set(t * x[:2]),
+    "entries added": lambda x, t: (x * x).at[jnp.array([1, 1])].add(t * x[:2]),
+    "an index beyond the end": lambda x, t: x.at[jnp.array([7, 1])].set(t * x[:2], mode="drop"),
+    "indices": lambda x, t: t * x[jnp.array([1, 2, 0])] * x,
+    "an index that varies": lambda x, t: x * x[jnp.floor(4 * t).astype(int) - 1],
+    "reversed": lambda x, t: t * jnp.flip(x) * x,
+    "cumulative sums": lambda x, t: jnp.cumsum(x * x) + t * jax.lax.cumsum(x, reverse=True),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_laws_in_few_numbers_run_in_the_kernel_with_their_derivatives(name):
+    """Matrix products, indices and updates are library calls or scatters, which it cannot hold."""
+    x, t = jnp.array([0.5, 2.0, -0.25]), jnp.array(0.75)
+    law = jax.make_jaxpr(LAWS[name])(x, t)
+
+    def field(x, t):
+        ready = specialise(law, [])
+        return ready.run(ready.coefficients, x, t)[0]
+
+    def derivative(f):
+        return lambda x, t, bar: jax.vjp(f, x, t)[1](bar)
+
+    bar = jnp.array([1.0, -2.0, 4.0])
+    close = {"rtol": 1e-14, "atol": 1e-14}
+    np.testing.assert_allclose(field(x, t), LAWS[name](x, t), **close)
+    pairs = zip(derivative(field)(x, t, bar), derivative(LAWS[name])(x, t, bar))
+    for found, expected in pairs:
+        np.testing.assert_allclose(found, expected, **close)
+    rows = [jnp.stack([a, 2 * a]) for a in (x, t, bar)]
+    for program in (field, derivative(field)):
+        given = rows if program is not field else rows[:2]
+        assert is_fusible(_without_preparation(jax.make_jaxpr(jax.vmap(program))(*given)))
+    plain = jax.make_jaxpr(jax.vmap(derivative(LAWS[name])))(*rows)
+    assert name == "reversed" or not is_fusible(plain.jaxpr)
+
+
+def _without_preparation(closed):
+    """The operations that depend on the inputs: the others are done once, before the loop."""
+    jaxpr = closed.jaxpr
+    known = set(jaxpr.invars)
+    for equation in (equations := list(jaxpr.eqns)):
+        if any(not isinstance(v, Literal) and v in known for v in equation.invars):
+            known.update(equation.outvars)
+    kept = [e for e in equations if set(e.outvars) & known]
+    return jaxpr.replace(eqns=kept, constvars=[], effects=set())
+
+
+def test_equal_operations_occur_once():
+    """A law that several wheels ask is one law; 0.0 and -0.0 are two numbers."""
+
+    def law(x):
+        return jnp.where(x > 0, jnp.sin(x), 2.0 * x)
+
+    def several(x):
+        a, b = x / 0.0, x / -0.0
+        return law(x) + law(x) * law(x), a, b
+
+    closed = jax.make_jaxpr(several)(1.5)
+    single = without_repeats(closed)
+    counts = [
+        sum(e.primitive.name == "sin" for p in nested_jaxprs(j.jaxpr) for e in p.eqns)
+        for j in (closed, single)
+    ]
+    assert counts == [3, 1]
+    assert jaxpr_as_fun(single)(1.5) == jaxpr_as_fun(closed)(1.5)
+    assert jaxpr_as_fun(single)(1.5)[1:] == [jnp.inf, -jnp.inf]
