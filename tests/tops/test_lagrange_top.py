@@ -28,7 +28,7 @@ def moved(numbers, t):
     q = q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
     zero = jnp.zeros_like(pull)
     force = jnp.stack([zero, zero, -pull], axis=-1)
-    top = Top(a, force, jnp.ones_like(pull), q, omega, c * omega[:, 2])
+    top = Top.of(a, force, jnp.ones_like(pull), q, omega, c * omega[:, 2])
     wxyz, rates = lagrange_motion(top, t[:, None])
     return jnp.concatenate([rates[:, 0], wxyz[:, 0]], axis=-1).T
 

@@ -79,6 +79,11 @@ class Top(NamedTuple):
     omega: Float[Array, "n 3"]
     axial: Float[Array, " n"]
 
+    @classmethod
+    def of(cls, transverse, force, distance, wxyz, omega, axial) -> "Top":
+        """From the moment A (N,) [kg m^2], the weight [N] and the axial momentum [kg m^2/s]."""
+        return cls(force / transverse[:, None], distance, wxyz, omega, axial / transverse)
+
 
 class LagrangeTop(AbstractChunkedForm):
     """Lagrange's top in theta functions, O(1) in time: exact.
@@ -128,8 +133,7 @@ class LagrangeTop(AbstractChunkedForm):
         gravity: Any = scene.potential
         centre = as_lanes(gravity.centre, n, 1)
         force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
-        force, axial = force / transverse[:, None], axial / transverse
-        top = Top(force, centre[:, 2], state.wxyz, state.omega_body, axial)
+        top = Top.of(transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial)
         wxyz, omega = lagrange_motion(top, elapsed)
         is_valid = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
         return wxyz, omega, is_valid & wheels_have_constant_momentum(scene, n)

@@ -30,8 +30,8 @@ _FUSIBLE_OPERATIONS = frozenset(
      custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
      exp exp2 expm1 floor gather ge gt in_double integer_pow iota is_finite jit le linear_map log
      log1p logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
-     reduce_max reduce_min reduce_or reduce_sum rem reshape rev round rsqrt scan select_n
-     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stage
+     reduce_max reduce_min reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt scan
+     select_n shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stage
      stop_gradient sub tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a unit can contain; functions with others are compiled as usual."""

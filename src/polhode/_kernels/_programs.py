@@ -118,8 +118,7 @@ def fusible_binder(equation: Any) -> Callable[..., Any]:
     """``binder``; products of small matrices, indexing and cumulative sums of few entries are
     evaluated by sums and selections."""
     form = _FORMS.get(equation.primitive.name)
-    result = equation.outvars[0].aval
-    if form is None or not jnp.issubdtype(result.dtype, jnp.floating):
+    if form is None or not jnp.issubdtype(equation.outvars[0].aval.dtype, jnp.floating):
         return binder(equation)
     return form(equation) or binder(equation)
 
