@@ -303,8 +303,10 @@ def _shared(operations: Sequence[_LoopOperation], outputs) -> frozenset[int]:
     results = []
     for operand in outputs:
         producer = operations[producers[operand[0]]] if loop_inputs([operand]) else None
-        concatenated = producer is not None and producer.name == "concatenate"
-        results += producer.operands if concatenated else [operand]
+        if producer is not None and producer.name == "concatenate":
+            results += producer.operands
+        else:
+            results.append(operand)
     use_counts = dict.fromkeys(producers, 0)
     dependent_results: dict[int, set[int]] = {i: set() for i in producers}
     for k, operand in enumerate(results):
