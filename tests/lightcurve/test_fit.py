@@ -192,7 +192,6 @@ def test_a_tumbler_is_found_again():
     assert all(note in text for note in fit.notes)
 
 
-@pytest.mark.slow
 def test_an_unknown_pole_has_the_spread_of_random_directions():
     directions = np.random.default_rng(0).normal(size=(100_000, 3))
     angles = np.arccos(directions[:, 2] / np.linalg.norm(directions, axis=1))
@@ -202,6 +201,7 @@ def test_an_unknown_pole_has_the_spread_of_random_directions():
     assert _solutions.pole_std_of(np.array([3e-3, 4e-3, 0])) == pytest.approx(np.degrees(5e-3))
 
 
+@pytest.mark.slow
 def test_how_much_zero_points_differ_is_learnt():
     curve, truth, _ = light_curves.synthetic(3, 0.02, nights=10, days=16.0, each=14, spread=0.06)
     fit = lightcurve.fit_light_curve(
