@@ -235,6 +235,15 @@ def test_laws_in_few_numbers_run_in_the_kernel_with_their_derivatives(name):
     assert name == "reversed" or not is_fusible(plain.jaxpr)
 
 
+def test_a_function_of_an_entry_is_no_update():
+    """``apply`` is a scatter as ``set`` is, but of a function; JAX does not differentiate it."""
+    x = jnp.array([0.5, 2.0, -0.25])
+    law = jax.make_jaxpr(lambda x: x.at[jnp.array([2, 0])].apply(jnp.sin))(x)
+    ready = specialise(law, [])
+    found = ready.run(ready.coefficients, x)[0]
+    np.testing.assert_array_equal(found, [np.sin(0.5), 2.0, np.sin(-0.25)])
+
+
 def _without_preparation(closed):
     """The operations that depend on the inputs: the others are done once, before the loop."""
     jaxpr = closed.jaxpr

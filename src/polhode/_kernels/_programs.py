@@ -208,7 +208,11 @@ def update_form(equation: Any, indices: Array) -> tuple[Callable[..., Any], Arra
     name = equation.primitive.name
     small = values.size * updates.size <= _policy.KERNEL_INDEX
     is_float = jnp.issubdtype(values.dtype, jnp.floating)
-    if name not in ("scatter", "scatter-add") or not (small and is_float):
+    # ``x.at[i].apply(fn)`` is a scatter whose ``update_jaxpr`` is the function
+    is_plain = name == "scatter-add" or (
+        name == "scatter" and equation.params["update_jaxpr"] is None
+    )
+    if not (is_plain and small and is_float):
         return None
     if name == "scatter":
         ids = (_ids(x.shape, values.dtype, k) for x, k in ((values, 0), (updates, values.size)))
