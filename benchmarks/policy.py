@@ -38,7 +38,7 @@ FIELDS = (*STEPS, *GRADIENTS[2:])
 # alternative values and scenes, for each name
 CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "FUSION": ((False,), ALL),
-    "FOLDING": ((False,), FIELDS),
+    "FOLDING": ((False,), (*FIELDS, "cluster of wheels")),
     "STAGING": ((False,), ALL),
     "REFILLING": ((False,), ("heavy tops", "gradient of heavy tops")),
     "TIME_LOOP": ((False,), ("free bodies, 100 times",)),
@@ -122,8 +122,18 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
     knots = np.linspace(0.0, 20.0, 100)
     table = ph.Table(knots, 0.1 * np.stack([np.sin(knots), np.cos(knots), knots / 20], axis=1), 1)
 
+    frame, corners = ph.LVLH(orbit), [[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]
+
+    def pointing(t, wxyz, omega):
+        error, rate = frame.to_frame(wxyz, omega, t)
+        return -0.2 * jnp.sign(error[0]) * error[1:] - 0.4 * rate
+
     def triaxial(potential=None, torque=None):
         return lambda m: ph.Scene(ph.Inertia.from_moments(m), potential, torque)
+
+    def clustered(m):
+        wheels = ph.wheel_cluster(corners, 1e-3, pointing, max_torque=0.05)
+        return ph.Scene(ph.Inertia.from_moments(m), rotors=wheels)
 
     def symmetric(potential=None, torque=None):
         return lambda m: ph.Scene(ph.Inertia.axisymmetric(m[..., 0], m[..., 2]), potential, torque)
@@ -254,6 +264,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "gradient of a matrix law": slope(controlled, 1),
         "torque in a table": value(tabulated, 1),
         "gradient of a torque in a table": slope(tabulated, 1),
+        "cluster of wheels": value(clustered, 1),
         "network": value(triaxial(None, ph.FeedbackTorque(network)), 10),
         "gradient of networks": slope(triaxial(None, ph.FeedbackTorque(network)), 64),
         "gradient of free bodies": slope(triaxial(), BODIES),

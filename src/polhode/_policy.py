@@ -33,7 +33,7 @@ Otherwise it starts a task for every array, and repeats the arithmetic of one ta
 FOLDING = True
 """[switch] Terms that depend on parameters alone are computed before the integration loop, and sums
 with zero and products with one, which automatic differentiation of H produces, are removed
-(``specialise``)."""
+(``specialise``), and so are equal operations before switches are found (``without_repeats``)."""
 
 STAGING = True
 """[switch] Values that many results share are computed once (``staged``). Otherwise XLA computes

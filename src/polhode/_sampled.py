@@ -26,6 +26,7 @@ units in the last place of the times, if these are larger, as in single precisio
 ``_FARTHEST``."""
 
 _FARTHEST = 0.1
+"""[periods] Upper bound of that distance: times that are rounded more coarsely stay apart."""
 
 
 def is_sampled(scene: Scene) -> bool:

@@ -10,7 +10,7 @@ from polhode import plot
 from polhode._scene._scene import places_of
 from polhode.fit import FitOptions, Gyroscope, Recording
 from polhode.fit._conclude import _prior_disagrees
-from polhode.fit._scene_motions import LeafMotion
+from polhode.fit._model import LeafMotion
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])

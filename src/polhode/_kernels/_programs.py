@@ -82,6 +82,8 @@ def without_repeats(closed_jaxpr: ClosedJaxpr) -> ClosedJaxpr:
 
     A control law that several wheels evaluate is thereby one law, and its switches are one set.
     """
+    if not _policy.is_folded():
+        return closed_jaxpr
     jaxpr = closed_jaxpr.jaxpr
     first_results: dict[Any, Any] = {}  # variables by operation and operands
     replacements: dict[Any, Any] = {}

@@ -88,29 +88,21 @@ def build_inertia(file: SceneFile, dtype: DTypeLike = float) -> "Inertia | Varia
 
 def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
     """SceneFileError for an unphysical row of moments (n, 3) or tensors (n, 9)."""
+
+    def check(bad, what, name, values, remedy):
+        if bad.any():
+            row = int(np.argmax(bad))
+            found = f"row {row + 1}: {name}{values[row].tolist()}"
+            raise SceneFileError(file.path, "[inertia.table]", what, found, remedy)
+
     if rows.shape[-1] == 9:
         tensors = rows.reshape(-1, 3, 3)
         is_skew = ~np.asarray(is_symmetric(jnp.asarray(tensors)))
-        if is_skew.any():
-            row = int(np.argmax(is_skew))
-            raise SceneFileError(
-                file.path,
-                "[inertia.table]",
-                "a tensor that is not symmetric",
-                f"row {row + 1}: {tensors[row].tolist()}",
-                "equal products of inertia above and below the diagonal",
-            )
+        remedy = "equal products of inertia above and below the diagonal"
+        check(is_skew, "a tensor that is not symmetric", "", tensors, remedy)
         rows = np.linalg.eigvalsh(tensors)
-    impossible = ~possible_moments(rows)
-    if impossible.any():
-        row = int(np.argmax(impossible))
-        raise SceneFileError(
-            file.path,
-            "[inertia.table]",
-            "impossible moments",
-            f"row {row + 1}: principal moments {rows[row].tolist()}",
-            "positive moments of which none exceeds the sum of the others",
-        )
+    remedy = "positive moments of which none exceeds the sum of the others"
+    check(~possible_moments(rows), "impossible moments", "principal moments ", rows, remedy)
 
 
 def _numbers(table: Table, dtype: DTypeLike, *others: str) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ from polhode.fit._model import (
     FullTensor as FullTensor,
     MomentsOnly as MomentsOnly,
     Parameters as Parameters,
+    SceneMotion as SceneMotion,
     SteppedMotion as SteppedMotion,
 )
 from polhode.fit._options import FitOptions as FitOptions, Gyroscope as Gyroscope, Huber as Huber
@@ -34,4 +35,3 @@ from polhode.fit._residuals import (
     residuals as residuals,
 )
 from polhode.fit._result import Fit as Fit
-from polhode.fit._scene_motions import SceneMotion as SceneMotion

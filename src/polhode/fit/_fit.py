@@ -17,12 +17,11 @@ from polhode._method import AbstractMethod
 from polhode._scene import Scene
 from polhode._scene._scene import places_of
 from polhode.fit._conclude import conclude, conclude_scene
-from polhode.fit._model import FreeMotion, NoInertia, SteppedMotion, entries_of
+from polhode.fit._model import FreeMotion, LeafMotion, NoInertia, SteppedMotion, entries_of
 from polhode.fit._numerics import compiled
 from polhode.fit._options import FitOptions, Gyroscope, calibrate, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
 from polhode.fit._result import Fit, checked_fit
-from polhode.fit._scene_motions import LeafMotion
 from polhode.fit._solve import solve_fit
 
 # ``fit_inertia``: the inertia of bodies from recordings of their motion.

@@ -29,9 +29,8 @@ from polhode.fit._findings import (
     shown_beside_prior,
     shown_of_gain,
 )
-from polhode.fit._model import Parameters, entries_of, whole_of
+from polhode.fit._model import LeafMotion, Parameters, entries_of, whole_of
 from polhode.fit._residuals import Model
-from polhode.fit._scene_motions import LeafMotion
 from polhode.inertia import Inertia
 
 
