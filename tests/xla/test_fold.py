@@ -244,6 +244,19 @@ def test_a_function_of_an_entry_is_no_update():
     np.testing.assert_array_equal(found, [np.sin(0.5), 2.0, np.sin(-0.25)])
 
 
+def test_half_precision_keeps_indices():
+    """bfloat16 does not represent every whole number above 256."""
+    x = jnp.arange(400.0).astype(jnp.bfloat16)
+
+    def picked(x):
+        return (2 * x)[jnp.array([256, 257])]
+
+    ready = specialise(jax.make_jaxpr(picked)(x), [])
+    bar = jnp.array([1.0, 8.0], jnp.bfloat16)
+    (slope,) = jax.vjp(lambda x: ready.run(ready.coefficients, x)[0], x)[1](bar)
+    np.testing.assert_array_equal(slope, jnp.zeros_like(x).at[256:258].set(2 * bar))
+
+
 def _without_preparation(closed):
     """The operations that depend on the inputs: the others are done once, before the loop."""
     jaxpr = closed.jaxpr

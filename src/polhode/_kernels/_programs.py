@@ -120,9 +120,14 @@ def fusible_binder(equation: Any) -> Callable[..., Any]:
     """``binder``; products of small matrices, indexing and cumulative sums of few entries are
     evaluated by sums and selections."""
     form = _FORMS.get(equation.primitive.name)
-    if form is None or not jnp.issubdtype(equation.outvars[0].aval.dtype, jnp.floating):
+    if form is None or not _counts(equation.outvars[0].aval.dtype):
         return binder(equation)
     return form(equation) or binder(equation)
+
+
+def _counts(dtype: Any) -> bool:
+    """Whether the dtype represents the number of every entry exactly: half precision does not."""
+    return dtype in (np.float32, np.float64)
 
 
 def _product(equation: Any) -> Callable[..., Any] | None:
@@ -209,12 +214,11 @@ def update_form(equation: Any, indices: Array) -> tuple[Callable[..., Any], Arra
     values, _, updates = (v.aval for v in equation.invars)
     name = equation.primitive.name
     small = values.size * updates.size <= _policy.KERNEL_INDEX
-    is_float = jnp.issubdtype(values.dtype, jnp.floating)
     # ``x.at[i].apply(fn)`` is a scatter whose ``update_jaxpr`` is the function
     is_plain = name == "scatter-add" or (
         name == "scatter" and equation.params["update_jaxpr"] is None
     )
-    if not (is_plain and small and is_float):
+    if not (is_plain and small and _counts(values.dtype)):
         return None
     if name == "scatter":
         ids = (_ids(x.shape, values.dtype, k) for x, k in ((values, 0), (updates, values.size)))

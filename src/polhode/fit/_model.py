@@ -315,7 +315,16 @@ class SteppedMotion(AbstractMotion):
     def fixes_scale(self) -> bool:
         return self.spin_inertia is not None or (self.drag is not None and not self.fit_drag)
 
-    def __call__(self, tensor, omega, wxyz, times, wheel, unknown, acceleration=True):
+    def __call__(
+        self,
+        tensor: Float[Array, "3 3"],
+        omega: Float[Array, " 3"],
+        wxyz: Float[Array, " 4"] | None,
+        times: Float[Array, " t"],
+        wheel: Float[Array, " t"] | None,
+        unknown: Any,
+        acceleration: bool = True,
+    ) -> Predicted:
         inertia = Inertia(full=tensor)
         drag = unknown["drag"] if self.fit_drag else self.drag
         torque = None if drag is None else drag.torque(times.dtype)
@@ -408,7 +417,16 @@ class FreeMotion(AbstractMotion):
     def fixes_scale(self) -> bool:
         return False
 
-    def __call__(self, tensor, omega, wxyz, times, wheel, unknown, acceleration=True):
+    def __call__(
+        self,
+        tensor: Float[Array, "3 3"],
+        omega: Float[Array, " 3"],
+        wxyz: Float[Array, " 4"] | None,
+        times: Float[Array, " t"],
+        wheel: Float[Array, " t"] | None,
+        unknown: Any,
+        acceleration: bool = True,
+    ) -> Predicted:
         moments, axes, (yz, zx, xy) = principal(tensor)
         start = rotate(conjugate(axes), omega)
         attitude = None if wxyz is None else tuple(multiply(wxyz, axes))
@@ -445,9 +463,6 @@ def _right_product(q: Float[Array, " 4"]) -> Float[Array, "4 4"]:
     w, x, y, z = q
     rows = ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
     return jnp.stack([jnp.stack(row) for row in rows])
-
-
-# Motions of scenes: known torques, rotors, potentials and damping.
 
 
 def simulated(
@@ -491,7 +506,16 @@ class SceneMotion(AbstractMotion):
     def fixes_scale(self) -> bool:
         return self.shows_scale
 
-    def __call__(self, tensor, omega, wxyz, times, wheel, unknown, acceleration=True):
+    def __call__(
+        self,
+        tensor: Float[Array, "3 3"],
+        omega: Float[Array, " 3"],
+        wxyz: Float[Array, " 4"] | None,
+        times: Float[Array, " t"],
+        wheel: Float[Array, " t"] | None,
+        unknown: Any,
+        acceleration: bool = True,
+    ) -> Predicted:
         scene = self.build(Inertia(full=tensor), unknown)
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
 
