@@ -65,7 +65,7 @@ floats by a library call, which a kernel cannot contain."""
 KERNEL_TABLE = 1024
 """[numbers] Constant arrays up to this size are part of a kernel; larger ones are its operands."""
 
-KERNEL_PRODUCT = 32
+KERNEL_PRODUCT = 1024
 """[multiplications] Up to this number, a product of matrices in the field is written as a sum, as
 a kernel can contain only sums. Larger ones, as in networks, are one library call for all bodies."""
 

@@ -38,7 +38,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples, segment_iterations
 from polhode._integrate._switches import raising_on_hidden_switches
 from polhode._integrate._tableau import TSIT5
-from polhode._kernels import Distinct, is_fusible, kernel, map_chunks
+from polhode._kernels import Distinct, becomes_fusible, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -226,10 +226,14 @@ class AbstractIntegration(AbstractMethod):
             return self._solve_by_loop(scene, state, times, rtol, record, search, n)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-        if n <= _policy.KERNEL_BODIES:
+        size = self.chunk or (
+            1 if n == 1 else self._lanes_of_loop(scene, state, ts, record, search)
+        )
+        if n <= min(size, _policy.KERNEL_BODIES):
             unit = kernel(solve_chunk, linearised=True, of_units=True)
-            return map_chunks(unit, Distinct((lanes, times)), n, n)
-        size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
+            return unit(Distinct((lanes, times)))
+        if size == 1:
+            return map_chunks(solve_chunk, Distinct((lanes, times)), n, 1)
         # bodies of a chunk wait for each other: chunks of bodies with similar rates
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
@@ -237,12 +241,12 @@ class AbstractIntegration(AbstractMethod):
         return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
-        """Bodies that the loop integrates at the same time: as many as in one fused kernel (chunks
-        of 64 take 3 times as long for 50 satellites). If a kernel cannot contain the field, such as
-        a network with matrix products, more, to amortise the calls."""
+        """Bodies that the loop integrates at the same time: one in a fused kernel, because a kernel
+        for several takes twice as long to compile and is not faster. If a kernel cannot contain the
+        field, such as a network with large matrix products, more, to amortise the calls."""
         problem = self._problem(scene, state, ts, record, search)
-        fits = is_fusible(problem.closed_jaxpr.jaxpr)
-        return _policy.bodies_at_once(_policy.KERNEL_BODIES if fits else _policy.LANES)
+        fits = becomes_fusible(problem.closed_jaxpr.jaxpr)
+        return _policy.bodies_at_once(1 if fits else _policy.LANES)
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool

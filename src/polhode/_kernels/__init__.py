@@ -31,6 +31,7 @@ from polhode._kernels._fold import (
 )
 from polhode._kernels._fused import (
     any_of as any_of,
+    becomes_fusible as becomes_fusible,
     formula as formula,
     is_fusible as is_fusible,
     kernel as kernel,

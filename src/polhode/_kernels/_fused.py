@@ -22,7 +22,13 @@ from jax.sharding import AxisType
 
 from polhode import _policy
 from polhode._kernels._derivatives import is_nonzero_tangent, linear
-from polhode._kernels._programs import constants_as_operands, dependent_results, nested_jaxprs
+from polhode._kernels._programs import (
+    constants_as_operands,
+    dependent_results,
+    has_form,
+    is_small_product,
+    nested_jaxprs,
+)
 
 _FUSIBLE_OPERATIONS = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
@@ -206,11 +212,18 @@ def _uses_kernels() -> bool:
 
 def is_fusible(jaxpr: Any, batched: bool = False) -> bool:
     """Whether a unit can contain this program; ``batched``: it was made by ``vmap``."""
+    return _consists_of(jaxpr, lambda x: is_small_product(x) or (batched and _updates_slice(x)))
+
+
+def becomes_fusible(jaxpr: Any) -> bool:
+    """Whether units are used, and one can contain what ``specialise`` makes of this program."""
+    return _uses_kernels() and _consists_of(jaxpr, has_form)
+
+
+def _consists_of(jaxpr: Any, others: Callable[[Any], bool]) -> bool:
+    """Whether a program consists of operations that a unit can contain, and of ``others``."""
     return not _has_large_reduction(jaxpr) and all(
-        all(
-            equation.primitive.name in _FUSIBLE_OPERATIONS or (batched and _updates_slice(equation))
-            for equation in program.eqns
-        )
+        all(x.primitive.name in _FUSIBLE_OPERATIONS or others(x) for x in program.eqns)
         and all(_is_numeric(v.aval.dtype) for v in (*program.invars, *program.constvars))
         for program in nested_jaxprs(jaxpr)
     )

@@ -1,12 +1,15 @@
 """Operations on traced programs (jaxprs)."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial, reduce
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.core import ShapedArray
+from jax.extend.core import ClosedJaxpr, Literal, Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from polhode import _policy
@@ -130,26 +133,94 @@ def _counts(dtype: Any) -> bool:
     return dtype in (np.float32, np.float64)
 
 
-def _product(equation: Any) -> Callable[..., Any] | None:
-    a, b = (v.aval for v in equation.invars)
-    (contract_a, contract_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
-    result = equation.outvars[0].aval
-    terms = result.size * int(np.prod([a.shape[i] for i in contract_a]))
-    if terms > _policy.KERNEL_PRODUCT or not a.dtype == b.dtype == result.dtype:
-        return None
+def _product(equation: Any) -> Callable[..., Any]:
+    return lambda a, b: _product_p.bind(a, b, **equation.params)
+
+
+# A product of matrices of which the size of the whole batch decides, known when it is lowered: few
+# multiplications are a sum, which a kernel can contain, many one library call for all bodies.
+_product_p = Primitive("product")
+
+
+def is_small_product(equation: Any) -> bool:
+    """Whether an equation is a product of matrices that is evaluated as a sum."""
+    return equation.primitive is _product_p and _is_small(
+        *(v.aval for v in equation.invars), equation.params
+    )
+
+
+def _is_small(a: Any, b: Any, params: dict[str, Any]) -> bool:
+    (contracted, _), _ = params["dimension_numbers"]
+    size = _of_library(a, b, params).size * int(np.prod([a.shape[i] for i in contracted]))
+    return size <= _policy.KERNEL_PRODUCT
+
+
+def _of_library(a: Any, b: Any, params: dict[str, Any]) -> Any:
+    return jax.eval_shape(partial(jax.lax.dot_general_p.bind, **params), a, b)
+
+
+def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
+    if not _is_small(a, b, params):
+        return jax.lax.dot_general_p.bind(a, b, **params)
+    (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*contract_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*contract_b, *batch_b)]
+    # axes: those of the batch, of a, of b, and the contracted ones
+    a = jnp.transpose(a, (*batch_a, *free_a, *contract_a))
+    b = jnp.transpose(b, (*batch_b, *free_b, *contract_b))
+    first = len(batch_a) + len(free_a)
+    a = jnp.expand_dims(a, range(first, first + len(free_b)))
+    b = jnp.expand_dims(b, range(len(batch_a), first))
+    return jnp.sum(a * b, axis=range(a.ndim - len(contract_a), a.ndim))
 
-    def product(a, b):
-        # axes: those of the batch, of a, of b, and the contracted ones
-        a = jnp.transpose(a, (*batch_a, *free_a, *contract_a))
-        b = jnp.transpose(b, (*batch_b, *free_b, *contract_b))
-        first = len(batch_a) + len(free_a)
-        a = jnp.expand_dims(a, range(first, first + len(free_b)))
-        b = jnp.expand_dims(b, range(len(batch_a), first))
-        return jnp.sum(a * b, axis=range(a.ndim - len(contract_a), a.ndim))
 
-    return product
+def _with_products(fn: Callable[..., Array], *operands: Array) -> Array:
+    """A rule of JAX for ``dot_general``, with the primitive here in place of it."""
+    closed = jax.make_jaxpr(fn)(*operands)
+    values: dict[Any, Any] = dict(zip(closed.jaxpr.invars, operands, strict=True))
+    for equation in closed.jaxpr.eqns:
+        bind = _product if equation.primitive is jax.lax.dot_general_p else binder
+        values[equation.outvars[0]] = bind(equation)(*(values[v] for v in equation.invars))
+    return values[closed.jaxpr.outvars[0]]
+
+
+def _product_jvp(primals, tangents, **params):
+    (a, b), (da, db) = primals, tangents
+    changes = [_product_p.bind(da, b, **params)] if type(da) is not ad.Zero else []
+    changes += [_product_p.bind(a, db, **params)] if type(db) is not ad.Zero else []
+    return _product_p.bind(a, b, **params), reduce(ad.add_jaxvals, changes)
+
+
+def _product_transpose(cotangent, a, b, **params):
+    is_first = ad.is_undefined_primal(a)
+    unknown, known = (a.aval, b) if is_first else (b.aval, a)
+
+    def transpose(cotangent, known):
+        def of_unknown(x):
+            operands = (x, known) if is_first else (known, x)
+            return jax.lax.dot_general_p.bind(*operands, **params)
+
+        return jax.linear_transpose(of_unknown, unknown)(cotangent)[0]
+
+    change = (
+        cotangent if type(cotangent) is ad.Zero else _with_products(transpose, cotangent, known)
+    )
+    return (change, None) if is_first else (None, change)
+
+
+def _product_batch(arrays, dims, **params):
+    of_one = partial(jax.lax.dot_general_p.bind, **params)
+    return _with_products(jax.vmap(of_one, dims), *arrays), 0
+
+
+_product_p.def_impl(_evaluated_product)
+_product_p.def_abstract_eval(
+    lambda a, b, **params: ShapedArray((x := _of_library(a, b, params)).shape, x.dtype)
+)
+ad.primitive_jvps[_product_p] = _product_jvp
+ad.primitive_transposes[_product_p] = _product_transpose
+batching.primitive_batchers[_product_p] = _product_batch
+mlir.register_lowering(_product_p, mlir.lower_fun(_evaluated_product, multiple_results=False))
 
 
 def _ids(shape, dtype, first: int = 0) -> np.ndarray:
@@ -208,19 +279,33 @@ _FORMS = {
 }
 
 
-def update_form(equation: Any, indices: Array) -> tuple[Callable[..., Any], Array] | None:
-    """An update of few entries at ``indices`` that do not depend on the state: a function of the
-    array, a second array, which is computed here, and the new values. None for other equations."""
-    values, _, updates = (v.aval for v in equation.invars)
+def has_form(equation: Any) -> bool:
+    """Whether ``fusible_binder`` or ``update_form`` applies, if indices of updates are constant."""
+    if equation.primitive is jax.lax.dot_general_p:
+        return _is_small(*(v.aval for v in equation.invars), equation.params)
+    form = _FORMS.get(equation.primitive.name)
+    return _is_small_update(equation) if form is None else form(equation) is not None
+
+
+def _is_small_update(equation: Any) -> bool:
     name = equation.primitive.name
-    small = values.size * updates.size <= _policy.KERNEL_INDEX
     # ``x.at[i].apply(fn)`` is a scatter whose ``update_jaxpr`` is the function
     is_plain = name == "scatter-add" or (
         name == "scatter" and equation.params["update_jaxpr"] is None
     )
-    if not (is_plain and small and _counts(values.dtype)):
+    if not is_plain:
+        return False
+    values, _, updates = (v.aval for v in equation.invars)
+    return values.size * updates.size <= _policy.KERNEL_INDEX and _counts(values.dtype)
+
+
+def update_form(equation: Any, indices: Array) -> tuple[Callable[..., Any], Array] | None:
+    """An update of few entries at ``indices`` that do not depend on the state: a function of the
+    array, a second array, which is computed here, and the new values. None for other equations."""
+    if not _is_small_update(equation):
         return None
-    if name == "scatter":
+    values, _, updates = (v.aval for v in equation.invars)
+    if equation.primitive.name == "scatter":
         ids = (_ids(x.shape, values.dtype, k) for x, k in ((values, 0), (updates, values.size)))
         old, new = map(jnp.asarray, ids)
         places = binder(equation)(old, indices, new)
