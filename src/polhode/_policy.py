@@ -55,6 +55,10 @@ KERNEL_BODIES = 8
 integration. For more bodies, a kernel within a kernel makes the integration up to 1.05 times
 slower."""
 
+KERNEL_LANES = 1
+"""[bodies] At the same time in the loop of explicit steps, if a kernel can contain it. One for
+several bodies takes twice as long to compile, and its bodies wait for each other."""
+
 KERNEL_BATCH = 16
 """[bodies] In a kernel under ``jax.vmap``. A larger batch is a loop over kernels of this size."""
 
@@ -66,8 +70,9 @@ KERNEL_TABLE = 1024
 """[numbers] Constant arrays up to this size are part of a kernel; larger ones are its operands."""
 
 KERNEL_PRODUCT = 1024
-"""[multiplications] Up to this number, a product of matrices in the field is written as a sum, as
-a kernel can contain only sums. Larger ones, as in networks, are one library call for all bodies."""
+"""[multiplications] A product of matrices in the field with at most this number, for all bodies of
+the program together, is evaluated as a sum, which a kernel can contain. Larger ones are one library
+call for all bodies."""
 
 KERNEL_INDEX = 1024
 """[entries times results] Up to this number, an update of entries in the field, and the derivative

@@ -197,6 +197,10 @@ LAWS = {
     "batch of products": lambda x, t: jnp.einsum(
         "kij,kj->ki", t * jnp.arange(18.0).reshape(2, 3, 3), jnp.stack([x, x * x])
     ).sum(axis=0),
+    "layers of a network": lambda x, t: (
+        jnp.cos(jnp.arange(48.0).reshape(3, 16))
+        @ jnp.tanh(jnp.sin(t * jnp.arange(48.0).reshape(16, 3)) @ x)
+    ),
     "one entry set": lambda x, t: jnp.zeros(3).at[1].set(t * x[0]),
     "entries set": lambda x, t: (x * x).at[jnp.array([2, 0])].set(t * x[:2]),
     "entries added": lambda x, t: (x * x).at[jnp.array([1, 1])].add(t * x[:2]),
@@ -242,6 +246,38 @@ def test_a_function_of_an_entry_is_no_update():
     ready = specialise(law, [])
     found = ready.run(ready.coefficients, x)[0]
     np.testing.assert_array_equal(found, [np.sin(0.5), 2.0, np.sin(-0.25)])
+
+
+@pytest.mark.parametrize("size", [3, 40])
+def test_products_keep_their_rules(size):
+    """A product of matrices is a sum or a library call, as the size of the whole batch decides."""
+    weights = jnp.sin(jnp.arange(2.0 * size * size)).reshape(2, size, size)
+
+    def law(weights, x):
+        hidden = jnp.sin(jnp.einsum("kij,jk->ki", weights, jnp.stack([x, x * x], axis=1)))
+        return weights[0] @ hidden[1] + jnp.outer(hidden[0], x) @ hidden[0]
+
+    x = jnp.linspace(-1.0, 1.0, size)
+    ready = specialise(jax.make_jaxpr(law)(weights, x), [])
+
+    def prepared(weights, x):
+        return ready.run(ready.coefficients, weights, x)[0]
+
+    def results(law):
+        def of_one(weights, x):
+            value, tangent = jax.jvp(law, (weights, x), (weights * weights, 1 - x))
+            cotangents = jax.vjp(law, weights, x)[1](value)
+            slope = jax.grad(lambda x: jnp.sum(jax.vjp(law, weights, x)[1](x)[1] ** 2))(x)
+            return value, tangent, *cotangents, slope
+
+        rows = jnp.linspace(0.5, 1.0, 3)[:, None] * x[None]
+        of_all = jax.vmap(of_one, (None, 0))
+        return jax.jit(of_all)(weights, rows), jax.jit(jax.vmap(of_all, (0, None)))(
+            jnp.stack([weights, 2 * weights]), rows
+        )
+
+    for a, b in zip(jax.tree.leaves(results(prepared)), jax.tree.leaves(results(law))):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))
 
 
 def test_half_precision_keeps_indices():

@@ -241,12 +241,11 @@ class AbstractIntegration(AbstractMethod):
         return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
-        """Bodies that the loop integrates at the same time: one in a fused kernel, because a kernel
-        for several takes twice as long to compile and is not faster. If a kernel cannot contain the
-        field, such as a network with large matrix products, more, to amortise the calls."""
+        """Bodies that the loop integrates at the same time. If a kernel cannot contain the field,
+        such as a network with large matrix products, more, to amortise the calls."""
         problem = self._problem(scene, state, ts, record, search)
         fits = becomes_fusible(problem.closed_jaxpr.jaxpr)
-        return _policy.bodies_at_once(1 if fits else _policy.LANES)
+        return _policy.bodies_at_once(_policy.KERNEL_LANES if fits else _policy.LANES)
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool

@@ -133,12 +133,15 @@ def _counts(dtype: Any) -> bool:
     return dtype in (np.float32, np.float64)
 
 
-def _product(equation: Any) -> Callable[..., Any]:
+def _product(equation: Any) -> Callable[..., Any] | None:
+    dtypes = {v.aval.dtype for v in (*equation.invars, *equation.outvars)}
+    if len(dtypes) > 1:
+        return None
     return lambda a, b: _product_p.bind(a, b, **equation.params)
 
 
-# A product of matrices of which the size of the whole batch decides, known when it is lowered: few
-# multiplications are a sum, which a kernel can contain, many one library call for all bodies.
+# A product of matrices. How it is evaluated depends on its size with all bodies, which is known
+# when the program is lowered.
 _product_p = Primitive("product")
 
 
@@ -150,13 +153,10 @@ def is_small_product(equation: Any) -> bool:
 
 
 def _is_small(a: Any, b: Any, params: dict[str, Any]) -> bool:
-    (contracted, _), _ = params["dimension_numbers"]
-    size = _of_library(a, b, params).size * int(np.prod([a.shape[i] for i in contracted]))
-    return size <= _policy.KERNEL_PRODUCT
-
-
-def _of_library(a: Any, b: Any, params: dict[str, Any]) -> Any:
-    return jax.eval_shape(partial(jax.lax.dot_general_p.bind, **params), a, b)
+    (contracted, _), (batch, _) = params["dimension_numbers"]
+    common = int(np.prod([a.shape[i] for i in (*contracted, *batch)]))
+    multiplications = a.size * (b.size // max(common, 1))
+    return multiplications <= min(_policy.KERNEL_PRODUCT, _policy.KERNEL_SUM - 1)
 
 
 def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
@@ -176,12 +176,19 @@ def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
 
 def _with_products(fn: Callable[..., Array], *operands: Array) -> Array:
     """A rule of JAX for ``dot_general``, with the primitive here in place of it."""
-    closed = jax.make_jaxpr(fn)(*operands)
-    values: dict[Any, Any] = dict(zip(closed.jaxpr.invars, operands, strict=True))
-    for equation in closed.jaxpr.eqns:
-        bind = _product if equation.primitive is jax.lax.dot_general_p else binder
-        values[equation.outvars[0]] = bind(equation)(*(values[v] for v in equation.invars))
-    return values[closed.jaxpr.outvars[0]]
+    jaxpr = jax.make_jaxpr(fn)(*operands).jaxpr
+    values: dict[Any, Any] = dict(zip(jaxpr.invars, operands, strict=True))
+    for equation in jaxpr.eqns:
+        is_product = equation.primitive is jax.lax.dot_general_p
+        bind = (_product(equation) if is_product else None) or binder(equation)
+        values[equation.outvars[0]] = bind(*(values[v] for v in equation.invars))
+    return values[jaxpr.outvars[0]]
+
+
+@_product_p.def_abstract_eval
+def _shape_of_product(a, b, **params):
+    result = jax.eval_shape(partial(jax.lax.dot_general_p.bind, **params), a, b)
+    return ShapedArray(result.shape, result.dtype)
 
 
 def _product_jvp(primals, tangents, **params):
@@ -214,9 +221,6 @@ def _product_batch(arrays, dims, **params):
 
 
 _product_p.def_impl(_evaluated_product)
-_product_p.def_abstract_eval(
-    lambda a, b, **params: ShapedArray((x := _of_library(a, b, params)).shape, x.dtype)
-)
 ad.primitive_jvps[_product_p] = _product_jvp
 ad.primitive_transposes[_product_p] = _product_transpose
 batching.primitive_batchers[_product_p] = _product_batch
@@ -281,10 +285,12 @@ _FORMS = {
 
 def has_form(equation: Any) -> bool:
     """Whether ``fusible_binder`` or ``update_form`` applies, if indices of updates are constant."""
-    if equation.primitive is jax.lax.dot_general_p:
-        return _is_small(*(v.aval for v in equation.invars), equation.params)
     form = _FORMS.get(equation.primitive.name)
-    return _is_small_update(equation) if form is None else form(equation) is not None
+    if form is None:
+        return _is_small_update(equation)
+    if form is _product and not _is_small(*(v.aval for v in equation.invars), equation.params):
+        return False
+    return _counts(equation.outvars[0].aval.dtype) and form(equation) is not None
 
 
 def _is_small_update(equation: Any) -> bool:
