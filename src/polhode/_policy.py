@@ -69,7 +69,7 @@ floats by a library call, which a kernel cannot contain."""
 KERNEL_TABLE = 1024
 """[numbers] Constant arrays up to this size are part of a kernel; larger ones are its operands."""
 
-KERNEL_PRODUCT = 1024
+KERNEL_PRODUCT = 4096
 """[multiplications] A product of matrices in the field with at most this number, for all bodies of
 the program together, is evaluated as a sum, which a kernel can contain. Larger ones are one library
 call for all bodies."""

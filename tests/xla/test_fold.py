@@ -248,7 +248,7 @@ def test_a_function_of_an_entry_is_no_update():
     np.testing.assert_array_equal(found, [np.sin(0.5), 2.0, np.sin(-0.25)])
 
 
-@pytest.mark.parametrize("size", [3, 40])
+@pytest.mark.parametrize("size", [3, 40, 70])
 def test_products_keep_their_rules(size):
     """A product of matrices is a sum or a library call, as the size of the whole batch decides."""
     weights = jnp.sin(jnp.arange(2.0 * size * size)).reshape(2, size, size)

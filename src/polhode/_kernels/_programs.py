@@ -156,7 +156,7 @@ def _is_small(a: Any, b: Any, params: dict[str, Any]) -> bool:
     (contracted, _), (batch, _) = params["dimension_numbers"]
     common = int(np.prod([a.shape[i] for i in (*contracted, *batch)]))
     multiplications = a.size * (b.size // max(common, 1))
-    return multiplications <= min(_policy.KERNEL_PRODUCT, _policy.KERNEL_SUM - 1)
+    return 0 < multiplications <= _policy.KERNEL_PRODUCT
 
 
 def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
@@ -165,13 +165,25 @@ def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*contract_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*contract_b, *batch_b)]
-    # axes: those of the batch, of a, of b, and the contracted ones
-    a = jnp.transpose(a, (*batch_a, *free_a, *contract_a))
-    b = jnp.transpose(b, (*batch_b, *free_b, *contract_b))
+    # axes: those of the batch, of a, of b, and one for the contracted ones
+    count = int(np.prod([a.shape[i] for i in contract_a]))
+    a, b = (
+        jnp.transpose(x, (*batch, *free, *contracted)).reshape(
+            *(x.shape[i] for i in (*batch, *free)), count
+        )
+        for x, batch, free, contracted in (
+            (a, batch_a, free_a, contract_a),
+            (b, batch_b, free_b, contract_b),
+        )
+    )
     first = len(batch_a) + len(free_a)
     a = jnp.expand_dims(a, range(first, first + len(free_b)))
     b = jnp.expand_dims(b, range(len(batch_a), first))
-    return jnp.sum(a * b, axis=range(a.ndim - len(contract_a), a.ndim))
+    # sums as large as a kernel can contain
+    results = int(np.prod(jnp.broadcast_shapes(a.shape, b.shape)[:-1]))
+    step = max((_policy.KERNEL_SUM - 1) // results, 1)
+    blocks = [slice(k, k + step) for k in range(0, count, step)]
+    return reduce(jnp.add, [jnp.sum(a[..., k] * b[..., k], axis=-1) for k in blocks])
 
 
 def _with_products(fn: Callable[..., Array], *operands: Array) -> Array:
