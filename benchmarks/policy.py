@@ -43,7 +43,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "REFILLING": ((False,), ("heavy tops", "gradient of heavy tops")),
     "TIME_LOOP": ((False,), ("free bodies, 100 times",)),
     "KERNEL_BODIES": ((0, 64), ("heavy top", "ten heavy tops", "satellite", "clipped satellites")),
-    "KERNEL_LANES": ((8,), ("clipped satellites", "gradient of clipped satellites")),
+    "SINGLE_BODIES": ((0,), ("clipped satellites", "gradient of clipped satellites")),
     "KERNEL_BATCH": ((4, 64), ("tops under vmap", "free bodies under vmap", "Jacobian of a top")),
     "KERNEL_SUM": ((64,), ("gradient of heavy tops", "gradient of Lagrange's tops")),
     "KERNEL_TABLE": ((0,), ("heavy top", "heavy tops", "Lagrange's tops")),

@@ -38,7 +38,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples, segment_iterations
 from polhode._integrate._switches import raising_on_hidden_switches
 from polhode._integrate._tableau import TSIT5
-from polhode._kernels import Distinct, becomes_fusible, kernel, map_chunks
+from polhode._kernels import Distinct, becomes_fusible, is_fusible, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -241,11 +241,14 @@ class AbstractIntegration(AbstractMethod):
         return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
-        """Bodies that the loop integrates at the same time. If a kernel cannot contain the field,
-        such as a network with large matrix products, more, to amortise the calls."""
-        problem = self._problem(scene, state, ts, record, search)
-        fits = becomes_fusible(problem.closed_jaxpr.jaxpr)
-        return _policy.bodies_at_once(_policy.KERNEL_LANES if fits else _policy.LANES)
+        """Bodies that the loop integrates at the same time. A kernel for several cannot contain
+        networks. If none can contain the field, more bodies amortise the calls."""
+        program = self._problem(scene, state, ts, record, search).closed_jaxpr.jaxpr
+        lanes = _policy.LANES
+        if becomes_fusible(program):
+            is_batch = state.wxyz.shape[0] > _policy.SINGLE_BODIES and is_fusible(program)
+            lanes = _policy.KERNEL_BODIES if is_batch else 1
+        return _policy.bodies_at_once(lanes)
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool

@@ -147,12 +147,12 @@ _product_p = Primitive("product")
 
 def is_small_product(equation: Any) -> bool:
     """Whether an equation is a product of matrices that is evaluated as a sum."""
-    return equation.primitive is _product_p and _is_small(
-        *(v.aval for v in equation.invars), equation.params
-    )
+    avals = [v.aval for v in equation.invars]
+    return equation.primitive is _product_p and _is_small(avals, equation.params)
 
 
-def _is_small(a: Any, b: Any, params: dict[str, Any]) -> bool:
+def _is_small(operands: Sequence[Any], params: dict[str, Any]) -> bool:
+    a, b = operands
     (contracted, _), (batch, _) = params["dimension_numbers"]
     common = int(np.prod([a.shape[i] for i in (*contracted, *batch)]))
     multiplications = a.size * (b.size // max(common, 1))
@@ -160,7 +160,7 @@ def _is_small(a: Any, b: Any, params: dict[str, Any]) -> bool:
 
 
 def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
-    if not _is_small(a, b, params):
+    if not _is_small([a, b], params):
         return jax.lax.dot_general_p.bind(a, b, **params)
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*contract_a, *batch_a)]
@@ -300,7 +300,7 @@ def has_form(equation: Any) -> bool:
     form = _FORMS.get(equation.primitive.name)
     if form is None:
         return _is_small_update(equation)
-    if form is _product and not _is_small(*(v.aval for v in equation.invars), equation.params):
+    if form is _product and not _is_small([v.aval for v in equation.invars], equation.params):
         return False
     return _counts(equation.outvars[0].aval.dtype) and form(equation) is not None
 
