@@ -280,6 +280,16 @@ def test_products_keep_their_rules(size):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.max(np.abs(b)))
 
 
+def test_products_of_few_numbers_are_sums_for_any_number_of_bodies():
+    """Accelerators round the factors of library products in single precision."""
+    gain = jnp.arange(21.0).reshape(3, 7)
+    ready = specialise(jax.make_jaxpr(lambda x: gain @ jnp.sin(x))(jnp.ones(7)), [])
+    program = jax.make_jaxpr(jax.vmap(lambda x: ready.run(ready.coefficients, x)[0]))
+    names = {e.primitive.name for e in program(jnp.ones((10_000, 7))).jaxpr.eqns}
+    assert "reduce_sum" in names
+    assert not names & {"product", "dot_general"}
+
+
 def test_half_precision_keeps_indices():
     """bfloat16 does not represent every whole number above 256."""
     x = jnp.arange(400.0).astype(jnp.bfloat16)

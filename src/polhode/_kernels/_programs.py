@@ -137,7 +137,11 @@ def _product(equation: Any) -> Callable[..., Any] | None:
     dtypes = {v.aval.dtype for v in (*equation.invars, *equation.outvars)}
     if len(dtypes) > 1:
         return None
-    return lambda a, b: _product_p.bind(a, b, **equation.params)
+    # Few multiplications are a sum for any number of bodies: a library call takes longer, and on
+    # some accelerators rounds the factors in single precision.
+    size = _multiplications([v.aval for v in equation.invars], equation.params)
+    form = _sum if 0 < size * _policy.LANES < _policy.KERNEL_SUM else _product_p.bind
+    return lambda a, b: form(a, b, **equation.params)
 
 
 # A product of matrices. How it is evaluated depends on its size with all bodies, which is known
@@ -151,17 +155,24 @@ def is_small_product(equation: Any) -> bool:
     return equation.primitive is _product_p and _is_small(avals, equation.params)
 
 
-def _is_small(operands: Sequence[Any], params: dict[str, Any]) -> bool:
+def _multiplications(operands: Sequence[Any], params: dict[str, Any]) -> int:
     a, b = operands
     (contracted, _), (batch, _) = params["dimension_numbers"]
     common = int(np.prod([a.shape[i] for i in (*contracted, *batch)]))
-    multiplications = a.size * (b.size // max(common, 1))
-    return 0 < multiplications <= _policy.KERNEL_PRODUCT
+    return a.size * (b.size // max(common, 1))
+
+
+def _is_small(operands: Sequence[Any], params: dict[str, Any]) -> bool:
+    return 0 < _multiplications(operands, params) <= _policy.KERNEL_PRODUCT
 
 
 def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
-    if not _is_small([a, b], params):
-        return jax.lax.dot_general_p.bind(a, b, **params)
+    is_small = _is_small([a, b], params)
+    return (_sum if is_small else jax.lax.dot_general_p.bind)(a, b, **params)
+
+
+def _sum(a: Array, b: Array, **params: Any) -> Array:
+    """The product as a sum, in parts as large as a kernel can contain."""
     (contract_a, contract_b), (batch_a, batch_b) = params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*contract_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*contract_b, *batch_b)]
@@ -179,7 +190,6 @@ def _evaluated_product(a: Array, b: Array, **params: Any) -> Array:
     first = len(batch_a) + len(free_a)
     a = jnp.expand_dims(a, range(first, first + len(free_b)))
     b = jnp.expand_dims(b, range(len(batch_a), first))
-    # sums as large as a kernel can contain
     results = int(np.prod(jnp.broadcast_shapes(a.shape, b.shape)[:-1]))
     step = max((_policy.KERNEL_SUM - 1) // results, 1)
     blocks = [slice(k, k + step) for k in range(0, count, step)]
